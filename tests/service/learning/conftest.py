@@ -1,7 +1,6 @@
 """Fixtures of the learning tests; the service is shared because starting it starts a process."""
 
 from collections.abc import Iterator
-from itertools import count
 from pathlib import Path
 
 import pytest
@@ -27,13 +26,10 @@ def learning_service(
         yield started
 
 
-NUMBERS = count()
-
-
 @pytest.fixture
 def learning_model(learning_service: LearningService) -> LearningModel:
     """Model of one test, whose data set is not in the service."""
-    return learning_service.create_model(f"own-{next(NUMBERS)}")
+    return learning_service.create_model()
 
 
 @pytest.fixture

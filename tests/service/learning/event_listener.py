@@ -55,7 +55,7 @@ class EventListener:
 @contextmanager
 def follow_events(client: Any, path: str) -> Iterator[EventListener]:
     """Follow events until the end of the block; return once the first event has arrived."""
-    listener = client.portal.call(_make_listener)
+    listener = EventListener()
 
     async def run_request() -> None:
         scope = {
@@ -91,7 +91,3 @@ def follow_events(client: Any, path: str) -> Iterator[EventListener]:
 def follow_model(client: Any, model: str) -> AbstractContextManager[EventListener]:
     """Follow the live events of a model."""
     return follow_events(client, f"/v1/models/{model}/live")
-
-
-async def _make_listener() -> EventListener:
-    return EventListener()

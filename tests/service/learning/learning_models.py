@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from fastapi.testclient import TestClient
 import lipcore
 from service.app import create_app
 from service.foundation.settings import Settings
+from service.journal import log, snapshots
 from service.models import registry
 from service.storage.database import Database
 from service.storage.files import Files, new_id
@@ -24,6 +26,8 @@ BATCH_ROWS = 10
 RATE = 100.0
 """Rows per second of the streams in the tests."""
 QUERIES = {name: getattr(stream(seed=11, samples=20), name).tolist() for name in ("q", "dq", "ddq")}
+DEFAULT_OPTIONS = {"contact_threshold": 100.0, "on_change": "learn", "auto_refresh": False}
+MODEL_NUMBERS = count()
 
 
 def publish(database: Database, files: Files, trained: Path, model: str, **how: Any) -> int:
@@ -44,16 +48,13 @@ class LearningService:
 
     @property
     def service(self) -> ServiceParts:
-        """Return the parts of the service."""
         return service_of(self.client)
 
-    def create_model(self, model: str, **options: Any) -> LearningModel:
+    def create_model(self, model: str | None = None, **options: Any) -> LearningModel:
         """Create a model that learns with these options; by default the contact threshold is out of reach."""
-        self.publish(model)
-        learning_model = LearningModel(self.client, model)
-        learning_model.put(
-            "learning", {"contact_threshold": 100.0, "on_change": "learn", "auto_refresh": False, **options}
-        )
+        learning_model = LearningModel(self.client, model or f"own-{next(MODEL_NUMBERS)}")
+        self.publish(learning_model.name)
+        learning_model.put("learning", DEFAULT_OPTIONS | options)
         return learning_model
 
     def publish(self, model: str, **how: Any) -> int:
@@ -63,29 +64,24 @@ class LearningService:
 
 @dataclass(frozen=True)
 class LearningModel:
-    """Model in a learning service."""
+    """Model in a learning service; paths are those below the model."""
 
     client: TestClient
     name: str
 
     def url(self, path: str) -> str:
-        """Return the URL of a path below the model."""
         return f"/v1/models/{self.name}/{path}"
 
     def get(self, path: str, **params: Any) -> dict[str, Any]:
-        """Return the body of a GET response."""
         return read_json(self.client.get(self.url(path), params=params))
 
     def put(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        """Return the body of a PUT response."""
         return read_json(self.client.put(self.url(path), json=body))
 
     def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
-        """Return the body of a POST response."""
         return read_json(self.client.post(self.url(path), json=body))
 
     def delete(self, path: str) -> dict[str, Any]:
-        """Return the body of a DELETE response."""
         return read_json(self.client.delete(self.url(path)))
 
     def expect_error(self, method: str, path: str, status: int, code: str, **request: Any) -> dict[str, Any]:
@@ -98,13 +94,33 @@ class LearningModel:
         self.wait_for_revision(replies[-1]["revision"])
         return replies[-1]
 
-    def wait_for_revision(self, revision: int) -> dict[str, Any]:
-        """Return the prediction of QUERIES once it contains a revision."""
-        return eventually(lambda: (seen := self.predict())["revision"] >= revision and seen)
+    def wait_for_revision(self, revision: int, queries: dict[str, Any] = QUERIES) -> dict[str, Any]:
+        """Return the prediction of queries once it contains a revision."""
+        return eventually(lambda: (seen := self.predict(queries))["revision"] >= revision and seen)
 
     def predict(self, queries: dict[str, Any] = QUERIES) -> dict[str, Any]:
-        """Return the current prediction of queries."""
         return self.post("predict", queries)
+
+    def predict_motion(self, batch: dict[str, Any]) -> dict[str, Any]:
+        """Return the current prediction of the rows of a batch."""
+        return self.predict({name: batch[name] for name in ("q", "dq", "ddq")})
+
+    def find_batch(self, sequence: int, stream_id: str = "arm") -> Any:
+        """Return the logged batch with this sequence."""
+        with service_of(self.client).database.session() as session:
+            return log.find_batch(session, self.name, stream_id, sequence)
+
+    def delete_from_log(self, *sequences: int, stream_id: str = "arm") -> None:
+        """Delete batches from the log, as retention does."""
+        with service_of(self.client).database.transaction() as session:
+            for sequence in sequences:
+                event: Any = log.find_batch(session, self.name, stream_id, sequence)
+                snapshots._note_forgotten(session, event)
+                session.delete(event)
+
+    def last_audit_entry(self) -> dict[str, Any]:
+        """Return the newest entry of the model in the audit log."""
+        return read_json(self.client.get("/v1/audit", params={"model": self.name}))["items"][0]
 
 
 @contextmanager

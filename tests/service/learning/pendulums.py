@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from sqlalchemy import select
@@ -22,7 +22,6 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.statistics import collect, merge
 from service.foundation.settings import Settings
 from service.journal import log, snapshots, undo
-from service.journal.arrivals import NewBatch
 from service.journal.restore import RestoredState, advance, restore
 from service.learning.learner import publication
 from service.learning.learner.publication import Publication
@@ -33,6 +32,7 @@ from service.storage.disk import Disk
 from service.storage.files import Files
 from service.storage.storage import Storage
 from tests.service.data import QUICK, stream
+from tests.service.learning import batches
 
 ARM = "arm"
 ROWS = 10
@@ -40,7 +40,8 @@ ROWS = 10
 BEGIN = 1000.0
 """Event time of the first batch, s."""
 QUERIES = np.random.default_rng(5).uniform(-1.5, 1.5, (3, 40, 2))
-CLOSE = {"rtol": 1e-8, "atol": 1e-8}
+Predictions: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Torques and standard deviations."""
 
 
 @cache
@@ -118,23 +119,16 @@ class Arm:
         new_rows = fields.pop("rows", None) or make_rows(number, size)
         defaults: dict[str, Any] = {
             "stream_id": "s",
-            "kind": "batches",
-            "sequence": number,
-            "last_sequence": number,
-            "digest": f"{number:064x}",
             "offset": 0.0,
             "received": float(new_rows.time[-1]),
-            "version": 1,
-            "revision": 0,
             "rows": new_rows,
             "report": {"accepted": 0, "rejected": {}},
             "record": None,
         }
-        with self.database.transaction() as session:
-            return log.append_batch(session, model or self.model, NewBatch(**defaults | fields))[0].number
+        batch = batches.make_batch(number, **defaults | fields)
+        return batches.append_batches(self.database, batch, model=model or self.model)[0]
 
     def log_batches(self, *numbers: int) -> None:
-        """Log several batches."""
         for number in numbers:
             self.log_batch(number)
 
@@ -168,40 +162,37 @@ class Arm:
         return restore(self.database, self.files, self.model, 1, self.base, **arguments)
 
 
-def expected_predictions(numbers: Iterable[int] = (), parts: Iterable[Rows] = ()) -> tuple[np.ndarray, np.ndarray]:
+def expected_predictions(numbers: Iterable[int] = (), parts: Iterable[Rows] = ()) -> Predictions:
     """Return torques and standard deviations at QUERIES after the training and these batches, computed by one sum."""
     model = trained_model()
     posterior, known = model.posterior, model.posterior.statistics
     learnt = [*(make_rows(number) for number in numbers), *parts]
     if learnt:
-        all_rows = Rows.concatenate(learnt).learnt
-        residual = all_rows.tau - posterior.kernel.mean(all_rows.motion())
-        known = merge(
-            known, collect(posterior.basis, posterior.row_variance(all_rows.motion()), all_rows.motion(), residual)
-        )
+        rows = Rows.concatenate(learnt).learnt
+        motion = rows.motion()
+        residual = rows.tau - posterior.kernel.mean(motion)
+        known = merge(known, collect(posterior.basis, posterior.row_variance(motion), motion, residual))
     noise, misfit = posterior.noise_variance, posterior.misfit
     built = CompactPosterior.build(posterior.kernel, posterior.basis, known, noise, posterior.std_factor, misfit)
     return predict_queries(replace(model, posterior=built))
 
 
-def predict_queries(model: TorqueModel) -> tuple[np.ndarray, np.ndarray]:
+def predict_queries(model: TorqueModel) -> Predictions:
     """Return torques and standard deviations at QUERIES."""
     answer = model.predict(*QUERIES)
     return answer.tau, answer.tau_std
 
 
-def assert_predictions(found: TorqueModel | OnlineModel, expected: tuple[np.ndarray, np.ndarray]) -> None:
+def assert_predictions(found: TorqueModel | OnlineModel, expected: Predictions) -> None:
     """Check the predictions of a model against torques and standard deviations."""
     model = found.model() if isinstance(found, OnlineModel) else found
     for values, expected_values in zip(predict_queries(model), expected, strict=True):
-        np.testing.assert_allclose(values, expected_values, **CLOSE)
+        np.testing.assert_allclose(values, expected_values, rtol=1e-8, atol=1e-8)
 
 
-def predictions_differ(
-    one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], min_difference: float = 1e-6
-) -> bool:
-    """Return whether any torques differ by more than `least` N·m."""
-    return bool(np.abs(one[0] - other[0]).max() > min_difference)
+def predictions_differ(one: Predictions, other: Predictions) -> bool:
+    """Return whether any torques differ by more than 1e-6 N·m."""
+    return bool(np.abs(one[0] - other[0]).max() > 1e-6)
 
 
 def residual_record(error: float, count: int = 100) -> dict[str, Any]:

@@ -13,9 +13,10 @@ from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import CODES
 from service.journal import log
 from tests.service.data import stream
-from tests.service.learning.learning_models import QUERIES, RATE, LearningModel, LearningService
+from tests.service.learning.learning_models import QUERIES, RATE, LearningModel, LearningService, max_difference
 
 NAMES = ("t", "q", "dq", "ddq", "tau")
+MAX_DIFFERENCE_NM = 1e-8
 
 
 def make_recording(samples: int = 400, seed: int = 7, rate: float = RATE) -> Samples:
@@ -41,6 +42,13 @@ def send_batch(
     return learning_model.post("observations", make_request(sequence, body, stream_id, **changes))
 
 
+def expect_rejection(
+    learning_model: LearningModel, request: dict[str, Any], status: int = 422, code: str = "invalid_request"
+) -> dict[str, Any]:
+    """Return the error of a batch that is rejected."""
+    return learning_model.expect_error("POST", "observations", status, code, json=request)
+
+
 def read_logged_rows(learning_service: LearningService, learning_model: LearningModel) -> list[Rows]:
     """Return the logged rows of each batch of a model."""
     with learning_service.service.database.session() as session:
@@ -63,3 +71,15 @@ def predict_after_learning(
     model = OnlineModel.start(lipcore.load(learning_service.trained)).learn(rows).model()
     answer = model.predict(**{name: np.array(values) for name, values in QUERIES.items()})
     return {"tau": answer.tau.tolist(), "tau_std": answer.tau_std.tolist()}
+
+
+def assert_learnt(
+    learning_service: LearningService,
+    learning_model: LearningModel,
+    revision: int,
+    body: dict[str, Any],
+    weight: float | NDArray[np.float64] = INDEPENDENT_HZ / RATE,
+) -> None:
+    """Check that a revision predicts as after learning only these rows."""
+    expected = predict_after_learning(learning_service, body, weight)
+    assert max_difference(learning_model.wait_for_revision(revision), expected) < MAX_DIFFERENCE_NM

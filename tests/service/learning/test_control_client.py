@@ -7,7 +7,7 @@ import pytest
 
 from lipserve import ApiError, Client
 from service.journal.alarms import raise_alarm
-from tests.service.learning.learning_models import BATCH_ROWS, QUERIES, read_json
+from tests.service.learning.learning_models import BATCH_ROWS, QUERIES, LearningModel
 from tests.service.models.archives.packing import exported, import_archive, unpack
 
 
@@ -19,32 +19,27 @@ def client(learning_service):
     return made
 
 
-def assert_same(answer, body):
-    assert answer.as_dict() == body
-
-
-def assert_same_items(answers, body):
-    assert [each.as_dict() for each in answers] == body["items"]
-
-
 @pytest.mark.slow
 def test_client_reads_what_the_routes_return(learning_service, client):
-    learning_model = learning_service.create_model("seen-by-client")
-    tau = [[None, 0.0]] * BATCH_ROWS
+    name, tau = "seen-by-client", [[None, 0.0]] * BATCH_ROWS
+    learning_model = learning_service.create_model(name)
     learning_model.send_batches(0)
     learning_model.send_batches(1, tau=tau)
     learning_model.send_batches(0, stream_id="other")
-    assert_same(client.quality("seen-by-client"), learning_model.get("quality"))
-    assert_same_items(client.observations("seen-by-client"), learning_model.get("observations"))
-    assert [item.sequence for item in client.observations("seen-by-client", "arm", rejected=True)] == [1]
-    assert_same(client.observation("seen-by-client", "arm", 1), learning_model.get("observations/arm/1"))
-    seen = client.observation("seen-by-client", "arm", 1, rows=True)
+    with learning_service.service.database.transaction() as session:
+        raise_alarm(session, name, "novelty", "beyond", {})
+    for path, answer in (
+        ("quality", client.quality(name)),
+        ("observations/arm/1", client.observation(name, "arm", 1)),
+        ("learning", client.learning(name)),
+    ):
+        assert answer.as_dict() == learning_model.get(path), path
+    for path, answers in (("observations", client.observations(name)), ("alarms", client.alarms(name))):
+        assert [each.as_dict() for each in answers] == learning_model.get(path)["items"], path
+    assert [item.sequence for item in client.observations(name, "arm", rejected=True)] == [1]
+    seen = client.observation(name, "arm", 1, rows=True)
     assert seen.observed is not None
     assert seen.observed.tau == tau
-    assert_same(client.learning("seen-by-client"), learning_model.get("learning"))
-    with learning_service.service.database.transaction() as session:
-        raise_alarm(session, "seen-by-client", "novelty", "beyond", {})
-    assert_same_items(client.alarms("seen-by-client"), learning_model.get("alarms"))
 
 
 def test_client_changes_what_the_routes_change(learning_service, client):
@@ -72,28 +67,31 @@ def learning_model(learning_service):
     return learning_model
 
 
+def copy_model(learning_model, name, **options):
+    """Export a model and import it; return what the export says of itself, the version, and its prediction."""
+    archive = exported(learning_model.client, learning_model.name, **options)
+    answer = import_archive(learning_model.client, archive, name=name)
+    assert answer.status_code == 201
+    prediction = LearningModel(learning_model.client, name).predict(QUERIES | {"version": 1})
+    return json.loads(unpack(archive)["export.json"]), answer.json(), prediction
+
+
 def assert_close(one, other):
     for name in ("tau", "tau_std"):
         np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-12)
 
 
-def test_imported_version_predicts_like_the_learnt_one(learning_service, learning_model):
-    archive = exported(learning_service.client, learning_model.name)
-    about = json.loads(unpack(archive)["export.json"])
+def test_imported_version_predicts_like_the_learnt_one(learning_model):
+    about, version, prediction = copy_model(learning_model, "arrived")
     assert (about["learnt"], about["revision"]) == (True, learning_model.predict()["revision"])
-    version = import_archive(learning_service.client, archive, name="arrived").json()
     assert version["lineage"]["learnt"]["revision"] == about["revision"]
-    answer = read_json(learning_service.client.post("/v1/models/arrived/predict", json=QUERIES | {"version": 1}))
-    assert answer["revision"] == 0
-    assert_close(answer, learning_model.predict())
+    assert prediction["revision"] == 0
+    assert_close(prediction, learning_model.predict())
 
 
 def test_export_can_leave_out_what_was_learnt(learning_service, learning_model):
-    archive = exported(learning_service.client, learning_model.name, learnt=False)
-    about = json.loads(unpack(archive)["export.json"])
+    about, _, prediction = copy_model(learning_model, "untaught", learnt=False)
     assert (about["learnt"], about["revision"]) == (False, 0)
-    assert import_archive(learning_service.client, archive, name="untaught").status_code == 201
-    answer = read_json(learning_service.client.post("/v1/models/untaught/predict", json=QUERIES | {"version": 1}))
     fresh = learning_service.create_model("fresh").predict()
-    assert_close(answer, fresh)
-    assert np.abs(np.array(fresh["tau"]) - np.array(learning_model.predict()["tau"])).max() > 1e-6
+    assert_close(prediction, fresh)
+    assert np.abs(np.subtract(fresh["tau"], learning_model.predict()["tau"])).max() > 1e-6

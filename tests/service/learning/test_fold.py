@@ -16,14 +16,13 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
 from sqlalchemy import delete
 from threadpoolctl import threadpool_limits
 
-import lipcore
 from lipcore.online import transfer
 from lipcore.online.transfer import Revision
+from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal import restore as restoring
 from service.journal.floor import error_floor_of
 from service.journal.restore import RestoredState, advance, restore
-from service.models import registry
 from service.storage.database import Database, EventRow, SnapshotRow
 from service.storage.files import Files
 from tests.service.learning.folding import Fold
@@ -66,22 +65,18 @@ class LearningMachine(RuleBasedStateMachine):
 
     @rule(at=st.integers(0, 30))
     def change(self, at: int) -> None:
-        """Log a change of the robot."""
         self.arm.log_event("change", t=BEGIN + at / 30)
 
     @rule(forgetting_s=st.sampled_from([None, 0.5, 2.0]))
     def settings(self, forgetting_s: float | None) -> None:
-        """Log how fast the model forgets."""
         self.arm.log_event("settings", forgetting_s=forgetting_s)
 
     @rule(seconds=st.sampled_from([None, 2.0]))
     def friction_walk(self, seconds: float | None) -> None:
-        """Log how fast friction drifts."""
         self.arm.log_event("settings", forgetting_s=None, friction_walk_s=seconds)
 
     @rule(choice=st.integers(0, 100))
     def unlearn(self, choice: int) -> None:
-        """Unlearn one of the batches, if there are any."""
         if batches := self._batches():
             self.arm.unlearn(batches[choice % len(batches)])
 
@@ -89,15 +84,12 @@ class LearningMachine(RuleBasedStateMachine):
     def replay(self, choice: int) -> None:
         """Learn rows of a batch that were rejected, if it was not undone."""
         batches = self._batches()
-        batch = batches[choice % len(batches)] if batches else None
-        if batch and not self.arm.find(batch).void:
+        if batches and not self.arm.find(batch := batches[choice % len(batches)]).void:
             self.arm.log_event("replay", make_rows(40 + choice % 20, SIZE), event=batch, codes=["contact"])
 
     @rule(choice=st.integers(0, 100))
     def rollback(self, choice: int) -> None:
-        """Roll back to an event that is in force."""
-        last = len(self._events())
-        if last > 1:
+        if (last := len(self._events())) > 1:
             free = [each for each in range(last) if each not in self.undone]
             to = free[choice % len(free)]
             self.undone |= set(range(to + 1, last + 1))
@@ -105,19 +97,16 @@ class LearningMachine(RuleBasedStateMachine):
 
     @rule(pages=st.integers(1, 4))
     def follow(self, pages: int) -> None:
-        """Learn some pages of the log."""
         self.known = self._followed(self.known, pages)
 
     @rule()
     def store(self) -> None:
-        """Store a snapshot of the state."""
         if self.known.number > self.start:
             place = ARM, self.version, self.known.number, self.known.seen
             snapshots.save(self.arm.database, self.arm.files, *place, transfer.dump(self.known.online), most=4)
 
     @rule()
     def restart(self) -> None:
-        """Begin with the newest snapshot."""
         self.known = restore(self.arm.database, self.arm.files, ARM, self.version, self.base, pages=0)
 
     def _followed(self, known: RestoredState, pages: int | None = None) -> RestoredState:
@@ -137,12 +126,11 @@ class LearningMachine(RuleBasedStateMachine):
             return
         with self.resources:
             states = [self._followed(self.known)]
-            self.restart()
-            states.append(self._followed(self.known))
-            with self.arm.database.transaction() as session:
-                session.execute(delete(SnapshotRow))
-            self.restart()
-            states.append(self._followed(self.known))
+            for _ in ("newest snapshot", "no snapshot"):
+                self.restart()
+                states.append(self._followed(self.known))
+                with self.arm.database.transaction() as session:
+                    session.execute(delete(SnapshotRow))
             assert {each.number for each in states} == {max(len(self._events()), self.start)}
             assert len({transfer.dump(each.online) for each in states}) == 1
 
@@ -183,24 +171,26 @@ def test_logs_that_were_learnt_wrongly_once_are_learnt_as_defined(page_rows, ste
     machine.teardown()
 
 
-def make(home: Path, page_rows: int, connection) -> None:
-    """Make the state of a log in a process, and send a digest of it and of the answers that are solved from it."""
+def make_state(home: Path, page_rows: int) -> list[str]:
+    """Return digests of the state of a log and of the answers that are solved from it."""
     threadpool_limits(1)
     restoring.PAGE_ROWS = page_rows
-    database, files = Database(home), Files(home)
-    base = lipcore.load(files.version_folder(registry.find(database, ARM, 1).folder))
-    known = restore(database, files, ARM, 1, base)
-    floor = error_floor_of(database, ARM, 1, known.number, 2)
-    revision = Revision.of(known.online.model(floor))
+    arm = Arm(Database(home), Files(home), Settings(home=home))
+    known = arm.restore_state()
+    revision = Revision.of(known.online.model(error_floor_of(arm.database, ARM, 1, known.number, 2)))
     arrays = [getattr(revision, each.name) for each in fields(revision)]
+    arm.database.close()
     made = [transfer.dump(known.online), *(np.ascontiguousarray(each).tobytes() for each in arrays)]
-    connection.send([hashlib.sha256(each).hexdigest() for each in made])
-    database.close()
+    return [hashlib.sha256(each).hexdigest() for each in made]
+
+
+def make_state_in_process(home: Path, page_rows: int) -> list[str]:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(make_state, (home, page_rows))
 
 
 @pytest.mark.slow
-def test_two_processes_reach_the_same_bits(home):
-    arm = Arm.open(home)
+def test_two_processes_reach_the_same_bits(home, arm):
     arm.log_batches(*range(4))
     arm.log_event("settings", forgetting_s=5.0)
     arm.log_batch(5, size=120)
@@ -208,21 +198,7 @@ def test_two_processes_reach_the_same_bits(home):
     arm.log_event("change", t=BEGIN + 20.0)
     arm.unlearn(6)
     arm.log_batch(90, rows=make_rows(1, size=600))
-    first, second = (_made(home, page_rows) for page_rows in (500, 1))
+    first, second = (make_state_in_process(home, page_rows) for page_rows in (500, 1))
     assert first == second
-    known = arm.restore_state(at_most=7)
-    payload = transfer.dump(known.online)
-    assert snapshots.save(arm.database, arm.files, ARM, 1, known.number, known.seen, payload, most=4) is not None
-    assert _made(home, 500)[0] == first[0]
-    arm.database.close()
-
-
-def _made(home: Path, page_rows: int) -> list[str]:
-    processes = multiprocessing.get_context("spawn")
-    ours, theirs = processes.Pipe(duplex=False)
-    process = processes.Process(target=make, args=(home, page_rows, theirs), daemon=True)
-    process.start()
-    theirs.close()
-    found = ours.recv()
-    process.join()
-    return found
+    arm.store_snapshot(at_most=7)
+    assert make_state_in_process(home, 500)[0] == first[0]

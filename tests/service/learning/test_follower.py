@@ -18,29 +18,30 @@ from service.learning.learner.worker import Learner
 from service.storage.database import SnapshotRow
 from tests.service.learning.pendulums import (
     ARM,
-    QUERIES,
-    Arm,
     assert_predictions,
     expected_predictions,
     make_rows,
+    predict_queries,
     trained_model,
 )
 
 
 @pytest.fixture
-def arm(home, monkeypatch):
+def arm(arm, monkeypatch):
     """Model with one version and without periodic snapshots."""
     monkeypatch.setattr(follower_module, "SNAPSHOT_PERIODS", 1e8)
-    opened_arm = Arm.open(home, max_loaded_models=2)
-    publication.clear(opened_arm.files)
-    yield opened_arm
-    opened_arm.database.close()
+    publication.clear(arm.files)
+    return arm
+
+
+def start_follower(arm):
+    """Return a follower of version 1 that has not read the log yet."""
+    return Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
 
 
 @pytest.fixture
 def follower(arm):
-    """Follower of version 1 that has not read the log yet."""
-    return Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
+    return start_follower(arm)
 
 
 def catch_up(follower):
@@ -51,14 +52,13 @@ def catch_up(follower):
     return follower
 
 
-def list_snapshots(arm, version=1):
-    """Return the event numbers of the snapshots of a version."""
+def list_snapshots(arm):
+    """Return the event numbers of the snapshots of version 1 of all models."""
     with arm.database.session() as session:
-        found = session.scalars(select(SnapshotRow.number).where(SnapshotRow.version == version))
-        return sorted(found)
+        return sorted(session.scalars(select(SnapshotRow.number).where(SnapshotRow.version == 1)))
 
 
-def read_published_model(arm, message):
+def read_published_model(message):
     """Return the model that the service would predict with."""
     return publication.read(message.path).apply(trained_model())
 
@@ -69,11 +69,11 @@ def test_logged_batches_are_published(arm, follower):
     assert (message.model, message.version, message.number, message.revision) == (ARM, 1, 3, 3)
     assert message.samples == pytest.approx(30)
     assert message.seconds > 0
-    assert_predictions(read_published_model(arm, message), expected_predictions(range(3)))
+    assert_predictions(read_published_model(message), expected_predictions(range(3)))
     assert not follower.unpublished
     arm.log_batches(3)
     assert catch_up(follower).unpublished
-    assert_predictions(read_published_model(arm, follower.publish()), expected_predictions(range(4)))
+    assert_predictions(read_published_model(follower.publish()), expected_predictions(range(4)))
 
 
 def test_rollback_is_published_as_higher_revision(arm, follower):
@@ -88,21 +88,19 @@ def test_rollback_is_published_as_higher_revision(arm, follower):
         assert not follower.unpublished or follower.number == 5  # no states within the rollback
     message = follower.publish()
     assert message.revision == 5
-    assert_predictions(read_published_model(arm, message), expected_predictions(range(2)))
+    assert_predictions(read_published_model(message), expected_predictions(range(2)))
 
 
 def test_rejected_batches_do_not_trigger_a_solve(arm, follower, monkeypatch):
     arm.log_batches(0, 1)
-    first = read_published_model(arm, catch_up(follower).publish())
+    before = predict_queries(read_published_model(catch_up(follower).publish()))
     kept_out = make_rows(2)
     kept_out.code[:] = 6
     arm.log_batch(2, rows=kept_out)
     monkeypatch.setattr(follower_module.Revision, "of", None)
     message = catch_up(follower).publish()
     assert message.revision == 3
-    assert_predictions(
-        read_published_model(arm, message), (first.predict(*QUERIES).tau, first.predict(*QUERIES).tau_std)
-    )
+    assert_predictions(read_published_model(message), before)
 
 
 def test_follower_resumes_from_stored_state(arm, follower, monkeypatch):
@@ -114,14 +112,14 @@ def test_follower_resumes_from_stored_state(arm, follower, monkeypatch):
     arm.log_batches(3)
     learnt = []
     monkeypatch.setattr(log, "decode", lambda payload, real=log.decode: learnt.append(1) or real(payload))
-    again = catch_up(Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base))
+    again = catch_up(start_follower(arm))
     assert len(learnt) == 1
-    assert_predictions(read_published_model(arm, again.publish()), expected_predictions(range(4)))
+    assert_predictions(read_published_model(again.publish()), expected_predictions(range(4)))
 
 
 def test_several_services_share_snapshots(arm, follower, monkeypatch):
     monkeypatch.setattr(arm.database.adapter, "shared", True)
-    other = Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
+    other = start_follower(arm)
     arm.log_batches(0, 1)
     catch_up(follower).store_in_turn()
     arm.log_batches(2)
@@ -137,12 +135,10 @@ def test_several_services_share_snapshots(arm, follower, monkeypatch):
 
 def test_snapshots_are_stored_after_clock_is_set_back(arm, follower, monkeypatch):
     monkeypatch.setattr(arm.database.adapter, "shared", True)
-    other = Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
     arm.log_batches(0)
-    catch_up(other).store()
+    catch_up(start_follower(arm)).store()
     arm.log_batches(1)
-    real = time.time
-    monkeypatch.setattr(time, "time", lambda: real() - 3600.0)
+    monkeypatch.setattr(time, "time", lambda real=time.time: real() - 3600.0)
     catch_up(follower).store_in_turn()
     assert list_snapshots(arm) == [1, 2]
 
@@ -179,22 +175,18 @@ def test_publication_contains_linearisation_error(arm, follower, monkeypatch):
 @pytest.fixture
 def learner(arm):
     """Learner that normally runs in the learner process."""
-    return Learner(arm.database, arm.files, arm.settings)
+    return Learner(arm.database, arm.files, arm.settings.model_copy(update={"max_loaded_models": 2}))
 
 
-def run_turns(learner, *woken, last=inf):
+def run_turns(learner, *woken):
     """Wake models and run turns until no follower has work; return the messages."""
     learner.wake(set(woken))
     messages = []
-    while learner.pause() < last and (
-        learner.pause() == 0 or any(each.unpublished for each in list_followers(learner))
+    while learner.pause() == 0 or (
+        learner.pause() < inf and any(each.unpublished for each in list(learner.followers.values()))
     ):
         messages += learner.turn()
     return messages
-
-
-def list_followers(learner):
-    return list(learner.followers.values())
 
 
 def test_only_the_serving_version_learns(arm, learner):
@@ -204,7 +196,7 @@ def test_only_the_serving_version_learns(arm, learner):
     arm.log_batch(0, model="other")
     messages = {(each.model, each.version): each for each in run_turns(learner, ARM)}
     assert set(messages) == {(ARM, 1)}
-    assert_predictions(read_published_model(arm, messages[ARM, 1]), expected_predictions(range(2)))
+    assert_predictions(read_published_model(messages[ARM, 1]), expected_predictions(range(2)))
 
 
 def test_replaced_version_is_stored_and_stops_learning(arm, learner):
@@ -223,31 +215,26 @@ def test_evicted_versions_are_stored_and_restored(arm, learner):
         arm.publish(name)
         arm.log_batch(0, model=name)
     arm.log_batches(0, 1)
-    run_turns(learner, ARM)
-    run_turns(learner, "b")
-    run_turns(learner, "c")
+    for name in (ARM, "b", "c"):
+        run_turns(learner, name)
     assert set(learner.followers) == {("b", 1), ("c", 1)}
     assert list_snapshots(arm) == [2]
     arm.log_batches(2)
     (message,) = run_turns(learner, ARM)
-    assert_predictions(read_published_model(arm, message), expected_predictions(range(3)))
+    assert_predictions(read_published_model(message), expected_predictions(range(3)))
     assert run_turns(learner, "nobody") == []
     learner.close()
     assert list_snapshots(arm) == [1, 1, 2, 3]  # closing stores all versions
 
 
-def test_snapshots_are_stored_periodically(home, monkeypatch):
+def test_snapshots_are_stored_periodically(arm, learner, monkeypatch):
     monkeypatch.setattr(follower_module, "SNAPSHOT_PERIODS", 0)
-    arm = Arm.open(home)
-    publication.clear(arm.files)
-    learner = Learner(arm.database, arm.files, arm.settings)
     arm.log_batches(0, 1)
     run_turns(learner, ARM)
     assert list_snapshots(arm) == [2]
-    arm.database.close()
 
 
-def test_failing_version_does_not_block_others(arm, learner, monkeypatch):
+def test_failing_version_does_not_block_others(arm, learner):
     arm.publish("other")
     arm.log_batch(0, model="other")
     arm.log_batches(0, 1)
@@ -268,17 +255,16 @@ def test_failed_version_is_retried_with_growing_pauses(arm, learner, monkeypatch
     def fail(self, floor):
         raise NotPositiveDefiniteError("no samples have such statistics")
 
-    real = follower_module.OnlineModel.model
-    monkeypatch.setattr(follower_module.OnlineModel, "model", fail)
     pauses = []
-    for _ in range(3):
-        (failed,) = run_turns(learner, ARM)
-        assert failed.error == "NotPositiveDefiniteError: no samples have such statistics"
-        ((at, pause),) = learner._failed.values()
-        pauses.append(pause)
-        learner._failed[ARM, 1] = (at - 100.0, pause)  # simulates the pause
+    with monkeypatch.context() as patch:
+        patch.setattr(follower_module.OnlineModel, "model", fail)
+        for _ in range(3):
+            (failed,) = run_turns(learner, ARM)
+            assert failed.error == "NotPositiveDefiniteError: no samples have such statistics"
+            ((at, pause),) = learner._failed.values()
+            pauses.append(pause)
+            learner._failed[ARM, 1] = (at - 100.0, pause)  # simulates the pause
     assert pauses == [1.0, 2.0, 4.0]
-    monkeypatch.setattr(follower_module.OnlineModel, "model", real)
     (message,) = run_turns(learner)
-    assert_predictions(read_published_model(arm, message), expected_predictions([0]))
+    assert_predictions(read_published_model(message), expected_predictions([0]))
     assert not learner._failed

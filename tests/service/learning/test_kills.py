@@ -1,10 +1,10 @@
 """Kills during ingest: acknowledged batches are logged and learnt exactly once."""
 
 import multiprocessing
-import os
 import signal
 import threading
 from contextlib import suppress
+from itertools import count
 
 import numpy as np
 import pytest
@@ -22,34 +22,30 @@ from tests.service.learning.batches import MODEL, find_stream, list_events, make
 ROWS = 50
 
 
-def send_batches(settings, acknowledged, sequence, count, later):
-    """Send batches from a sequence on; kill this process `later` s after `count` acknowledgements."""
+def send_batches(settings, acknowledged, first):
+    """Send batches from a sequence on, until this process is killed."""
     database = Database.of(settings)
-    killing = threading.Timer(later, os.kill, (os.getpid(), signal.SIGKILL))
-    while True:
+    for sequence in count(first):
         with database.transaction() as session:
             if log.find_batch(session, MODEL, "robot-1", sequence) is None:
                 log.append_batch(session, MODEL, make_batch(sequence, rows=make_rows(ROWS, seed=sequence)))
         acknowledged.send(sequence)
-        sequence += 1
-        count -= 1
-        if count == 0:
-            killing.start()
 
 
-def send_until_killed(home, sequence, count, later):
-    """Run a process that sends until it is killed; return the acknowledged sequences."""
+def send_until_killed(home, first, acknowledgements, later):
+    """Run a process that is killed `later` s after its acknowledgements; return the acknowledged sequences."""
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload([__name__])  # imports once for many processes
     ours, theirs = processes.Pipe(duplex=False)
-    given = Settings(home=home), theirs, sequence, count, later
-    process = processes.Process(target=send_batches, args=given, daemon=True)
+    process = processes.Process(target=send_batches, args=(Settings(home=home), theirs, first), daemon=True)
     process.start()
     theirs.close()
     acknowledged = []
     with suppress(EOFError):
         while ours.poll(DEADLINE):
             acknowledged.append(ours.recv())
+            if len(acknowledged) == acknowledgements:
+                threading.Timer(later, process.kill).start()
     process.join(DEADLINE)
     assert process.exitcode == -signal.SIGKILL
     return acknowledged

@@ -28,29 +28,17 @@ DEFAULTS = {
 }
 
 
-def read_offset(learning_model):
-    """Return the event time of the first row of the recording."""
-    return learning_model.get("learning")["status"]["streams"][0]["offset_s"]
-
-
-def pause_model(learning_service, learning_model):
-    """Pause a model at its next row, as ingest does after a change; return the event time."""
-    rows = count_logged_rows(learning_service, learning_model)
-    at = read_offset(learning_model) + rows * 0.01 - 0.005
-    with learning_service.service.database.transaction() as session:
-        number = log.newest(session, learning_model.name) + 1
-        owner.pause(session, learning_model.name, {"at": at, "event": number, "evidence": {"joints": ["joint1"]}})
-    return at
-
-
-def count_logged_rows(learning_service, learning_model):
+def list_logged(learning_service, learning_model, kind):
+    """Return the events of a kind."""
     with learning_service.service.database.session() as session:
-        return sum(event.rows for event in log.events(session, learning_model.name, 0, 100) if event.kind == "batch")
+        return [event for event in log.events(session, learning_model.name, 0, 100) if event.kind == kind]
 
 
-def list_changes(learning_service, learning_model):
-    with learning_service.service.database.session() as session:
-        return [event.detail for event in log.events(session, learning_model.name, 0, 100) if event.kind == "change"]
+def date_next_row(learning_service, learning_model):
+    """Return an event time between the last logged row and the next one."""
+    rows = sum(event.rows for event in list_logged(learning_service, learning_model, "batch"))
+    offset = learning_model.get("learning")["status"]["streams"][0]["offset_s"]  # event time of the first row
+    return offset + rows * 0.01 - 0.005
 
 
 def test_options_have_defaults(learning_service):
@@ -62,143 +50,116 @@ def test_options_have_defaults(learning_service):
     assert (status["novel_share"], status["failure"], status["reachable"]) == (None, None, [[0, 0]])
 
 
-def test_put_replaces_all_options(learning_service):
-    learning_model = learning_service.create_model("set")
+def test_put_replaces_all_options(learning_model):
     wanted = {"forgetting_s": 60.0, "torque_limits": [10.0, 5.0], "on_change": "adapt"}
     assert learning_model.put("learning", wanted)["options"] == DEFAULTS | wanted
-    assert learning_model.put("learning", {"contact_threshold": 4.0})["options"] == DEFAULTS | {
-        "contact_threshold": 4.0
-    }
-    assert learning_model.get("learning")["options"] == DEFAULTS | {"contact_threshold": 4.0}
+    wanted = {"contact_threshold": 4.0}
+    assert learning_model.put("learning", wanted)["options"] == DEFAULTS | wanted
+    assert learning_model.get("learning")["options"] == DEFAULTS | wanted
 
 
-def test_status_shows_revisions_and_streams(learning_service):
-    learning_model = learning_service.create_model("stands")
+def test_status_shows_revisions_streams_and_snapshots(learning_service, learning_model):
     learning_model.send_batches(0, 1, 5)
     learning_model.send_batches(7, stream_id="second")
+    service = learning_service.service
+    assert snapshots.save(service.database, service.files, learning_model.name, 1, 2, 4, b"state", most=9) is not None
     status = learning_model.get("learning")["status"]
     assert (status["revision"], status["published"], status["lag_events"], status["events"]) == (4, 4, 0, 4)
     assert 0 <= status["novel_share"] <= 1
-    streams = {each["stream_id"]: each for each in status["streams"]}
-    assert (streams["arm"]["last"], streams["arm"]["gaps"], streams["arm"]["missing"]) == (5, [[2, 4]], 3)
-    assert (streams["second"]["kind"], streams["second"]["gaps"], streams["second"]["forgotten"]) == (
-        "batches",
-        [],
-        None,
-    )
-    assert abs(streams["arm"]["offset_s"] - time.time()) < 600
-
-
-def test_status_lists_snapshots(learning_service):
-    learning_model = learning_service.create_model("stored")
-    learning_model.send_batches(0, 1)
-    service = learning_service.service
-    assert snapshots.save(service.database, service.files, "stored", 1, 2, 2, b"state", most=9) is not None
-    status = learning_model.get("learning")["status"]
+    arm, second = sorted(status["streams"], key=lambda each: each["stream_id"])
+    assert (arm["stream_id"], arm["last"], arm["gaps"], arm["missing"]) == ("arm", 5, [[2, 4]], 3)
+    assert (second["stream_id"], second["kind"], second["gaps"]) == ("second", "batches", [])
+    assert second["forgotten"] is None
+    assert abs(arm["offset_s"] - time.time()) < 600
     assert [each["revision"] for each in status["snapshots"]] == [2]
 
 
-@pytest.mark.parametrize("chunk", [decisions.CHUNK_EVENTS, 1])
-def test_adapt_with_replay_learns_held_rows_in_new_regime(learning_service, monkeypatch, chunk):
-    """Events are replayed in one transaction, or in one per batch."""
+@pytest.mark.parametrize(
+    ("decision", "replay", "chunk"),
+    [
+        ("adapt", True, decisions.CHUNK_EVENTS),
+        ("adapt", True, 1),
+        ("ignore", True, decisions.CHUNK_EVENTS),
+        ("ignore", False, decisions.CHUNK_EVENTS),
+    ],
+)
+def test_decision_learns_held_rows_if_replayed(learning_service, learning_model, monkeypatch, decision, replay, chunk):
+    """Events are replayed in one transaction, or in one per batch; `adapt` learns them in a new regime."""
     monkeypatch.setattr(decisions, "CHUNK_EVENTS", chunk)
-    paused, reference = learning_service.create_model(f"held-{chunk}"), learning_service.create_model(f"told-{chunk}")
-    paused.send_batches(0)
-    at = pause_model(learning_service, paused)
-    replies = [paused.send_batches(number) for number in (1, 2)]
+    reference = learning_service.create_model(f"{learning_model.name}-reference")
+    learning_model.send_batches(0)
+    at = date_next_row(learning_service, learning_model)
+    pause = {"at": at, "event": 2, "evidence": {"joints": ["joint1"]}}
+    with learning_service.service.database.transaction() as session:  # as ingest does after a change
+        owner.pause(session, learning_model.name, pause)
+    replies = [learning_model.send_batches(number) for number in (1, 2)]
     assert [each["rejected"] for each in replies] == [{"change": BATCH_ROWS}] * 2
     assert replies[-1]["held"] is True
-    assert paused.get("learning")["status"]["held"] == {"at": at, "evidence": {"joints": ["joint1"]}}
-    before = paused.predict()
+    assert learning_model.get("learning")["status"]["held"] == {"at": at, "evidence": {"joints": ["joint1"]}}
+    before = learning_model.predict()
 
-    result = paused.post("learning/change", {"decision": "adapt", "replay": True})
-    assert (result["decision"], result["at"], result["rows"]) == ("adapt", at, 2 * BATCH_ROWS)
-    assert paused.get("learning")["status"]["held"] is None
-    assert list_changes(learning_service, paused) == [{"t": at}]
-    adapted = paused.wait_for_revision(result["revision"])
+    body = {"decision": decision} | ({"replay": True} if replay else {})
+    result = learning_model.post("learning/change", body)
+    rows = 2 * BATCH_ROWS if replay else 0
+    assert (result["decision"], result["at"], result["rows"]) == (decision, at, rows)
+    assert learning_model.get("learning")["status"]["held"] is None
+    changes = [event.detail for event in list_logged(learning_service, learning_model, "change")]
+    assert changes == ([{"t": at}] if decision == "adapt" else [])
+    decided = learning_model.wait_for_revision(result["revision"])
 
     reference.send_batches(0)
-    with learning_service.service.database.transaction() as session:
-        log.append(
-            session, reference.name, "change", {"t": read_offset(reference) + BATCH_ROWS * 0.01 - 0.005}, time.time()
-        )
-    reference.send_batches(1, 2)
-    assert max_difference(adapted, reference.predict()) < MAX_DIFFERENCE
-    assert max_difference(adapted, before) > 1e3 * MAX_DIFFERENCE
-    assert paused.send_batches(3)["accepted"] == BATCH_ROWS
+    if decision == "adapt":
+        detail = {"t": date_next_row(learning_service, reference)}
+        with learning_service.service.database.transaction() as session:
+            log.append(session, reference.name, "change", detail, time.time())
+    if replay:
+        reference.send_batches(1, 2)
+    assert max_difference(decided, reference.predict()) < MAX_DIFFERENCE
+    assert (max_difference(decided, before) > 1e3 * MAX_DIFFERENCE) == replay
+    assert learning_model.send_batches(3)["accepted"] == BATCH_ROWS
+    reference.send_batches(3)
+    assert max_difference(learning_model.predict(), reference.predict()) < MAX_DIFFERENCE
+    if not replay:
+        assert learning_model.post("observations/arm/1/replay", {"codes": ["change"]})["rows"] == BATCH_ROWS
 
 
-def test_ignore_with_replay_equals_uninterrupted_learning(learning_service):
-    paused, reference = learning_service.create_model("ignores"), learning_service.create_model("steady")
-    paused.send_batches(0)
-    pause_model(learning_service, paused)
-    paused.send_batches(1)
-    result = paused.post("learning/change", {"decision": "ignore", "replay": True})
-    assert (result["rows"], list_changes(learning_service, paused)) == (BATCH_ROWS, [])
-    reference.send_batches(0, 1)
-    assert max_difference(paused.wait_for_revision(result["revision"]), reference.predict()) < MAX_DIFFERENCE
-
-
-def test_held_rows_are_not_learnt_without_replay(learning_service):
-    paused, reference = learning_service.create_model("stay-out"), learning_service.create_model("short")
-    paused.send_batches(0)
-    pause_model(learning_service, paused)
-    paused.send_batches(1)
-    assert paused.post("learning/change", {"decision": "ignore"})["rows"] == 0
-    paused.send_batches(2)
-    reference.send_batches(0, 2)
-    assert max_difference(paused.predict(), reference.predict()) < MAX_DIFFERENCE
-    assert paused.post("observations/arm/1/replay", {"codes": ["change"]})["rows"] == BATCH_ROWS
-
-
-def test_decision_without_pause_is_rejected(learning_service):
-    learning_model = learning_service.create_model("undecided")
+def test_decision_without_pause_is_rejected(learning_model):
     learning_model.send_batches(0)
     for decision in ("adapt", "ignore"):
         learning_model.expect_error("POST", "learning/change", 409, "conflict", json={"decision": decision})
-    learning_model.expect_error("POST", "learning/change", 422, "invalid_request", json={"decision": "wait"})
     assert learning_model.get("learning")["status"]["events"] == 1
 
 
-def read_options(database, model=MODEL):
-    with database.session() as session:
-        return owner.read_options(session, model)
-
-
-def set_options(database, model=MODEL, **fields):
-    owner.set_options(database, model, LearningOptions(**fields), 2, 500.0)
-
-
-def list_other_events(database, model=MODEL):
-    return [(event.number, event.kind, event.detail) for event in list_events(database, model) if event.kind != "batch"]
-
-
 def test_only_time_constants_are_logged_as_settings(database):
-    set_options(database, contact_threshold=5.0)
-    assert list_other_events(database) == []
-    set_options(database, forgetting_s=60.0)
+    def set_options(model=MODEL, **fields):
+        owner.set_options(database, model, LearningOptions(**fields), 2, 500.0)
+
+    set_options(contact_threshold=5.0)
+    assert list_events(database) == []
+    set_options(forgetting_s=60.0)
     append_batches(database, make_batch(0))
-    set_options(database, forgetting_s=60.0, enabled=False)
-    set_options(database, forgetting_s=30.0)
-    set_options(database)
-    set_options(database, friction_walk_s=1800.0)
-    assert list_other_events(database) == [
+    set_options(forgetting_s=60.0, enabled=False)
+    set_options(forgetting_s=30.0)
+    set_options()
+    set_options(friction_walk_s=1800.0)
+    first, _, *later = list_events(database)
+    assert [(event.number, event.kind, event.detail) for event in (first, *later)] == [
         (1, "settings", {"forgetting_s": 60.0}),
         (3, "settings", {"forgetting_s": 30.0}),
         (4, "settings", {"forgetting_s": None}),
         (5, "settings", {"forgetting_s": None, "friction_walk_s": 1800.0}),
     ]
-    assert list_events(database)[0].received == 500.0
+    assert first.received == 500.0
     with pytest.raises(NotFoundError, match="no model 'nobody'"):
-        set_options(database, model="nobody")
+        set_options(model="nobody")
 
 
-def test_alarms_are_listed_newest_first(learning_service):
-    learning_model = learning_service.create_model("alarmed")
+def test_alarms_are_listed_newest_first(learning_service, learning_model):
     assert learning_model.get("alarms") == {"items": [], "next_cursor": None}
     with learning_service.service.database.transaction() as session:
         for number, kind in enumerate(("change", "novelty", "refresh", "promotion")):
-            raise_alarm(session, "alarmed", kind, f"message {number}", {"number": number, "joints": ["joint1"]})
+            evidence = {"number": number, "joints": ["joint1"]}
+            raise_alarm(session, learning_model.name, kind, f"message {number}", evidence)
         raise_alarm(session, "panda-sim", "change", "of another model", {})
     first = learning_model.get("alarms", limit=3)
     rest = learning_model.get("alarms", limit=3, cursor=first["next_cursor"])
@@ -215,6 +176,7 @@ MODEL_ROUTES = (
     "GET learning",
     "PUT learning",
     "POST learning/change",
+    "GET payload",
     "GET quality",
     "GET alarms",
     "GET observations",

@@ -23,12 +23,11 @@ from tests.service.server import Server
 from tests.service.streams import TAU, frame, open_stream, read_hello
 
 
-def test_live_rows_contain_predictions_made_before_learning(learning_service):
-    learning_model = learning_service.create_model("seen")
-    sent = observation_batch(0)
-    model = learning_service.service.loaded.get("seen", None).model
-    before = model.predict(*(np.array(sent[name]) for name in ("q", "dq", "ddq")))
-    with follow_model(learning_service.client, "seen") as listener:
+def test_live_rows_contain_predictions_made_before_learning(learning_service, learning_model):
+    sent = {name: np.array(values) for name, values in observation_batch(0).items()}
+    model = learning_service.service.loaded.get(learning_model.name, None).model
+    before = model.predict(*(sent[name] for name in ("q", "dq", "ddq")))
+    with follow_model(learning_service.client, learning_model.name) as listener:
         assert listener.status == 200
         assert listener.events[0][0] == "status"
         reply = learning_model.send_batches(0)
@@ -39,18 +38,17 @@ def test_live_rows_contain_predictions_made_before_learning(learning_service):
         assert part["counts"] == {"learnt": BATCH_ROWS}
         shown = len(part["time"])
         assert 1 <= shown <= BATCH_ROWS
-        places = [int(np.abs(np.array(sent["tau"]) - row).sum(axis=1).argmin()) for row in np.array(part["tau"])]
+        places = [int(np.abs(sent["tau"] - row).sum(axis=1).argmin()) for row in np.array(part["tau"])]
         assert places == sorted(set(places))
-        for name, expected in (("tau", np.array(sent["tau"])), ("mean", before.tau), ("std", before.tau_std)):
+        for name, expected in (("tau", sent["tau"]), ("mean", before.tau), ("std", before.tau_std)):
             assert np.allclose(part[name], expected[places], atol=1e-6), name
-        assert np.allclose(part["q"], np.array(sent["q"])[places[-1]], atol=1e-6)
+        assert np.allclose(part["q"], sent["q"][places[-1]], atol=1e-6)
         assert part["noise_std"] == model.noise_std.tolist()
         total = np.sqrt(before.tau_std**2 + model.noise_std**2)
-        worst = (np.abs(np.array(sent["tau"]) - before.tau) / total).max(axis=0)
+        worst = (np.abs(sent["tau"] - before.tau) / total).max(axis=0)
         assert np.allclose(part["worst"], worst, atol=2e-3)
-        status = eventually(
-            lambda: (last := listener.list_data("status")[-1])["revision"] == reply["revision"] and last
-        )
+        eventually(lambda: listener.list_data("status")[-1]["revision"] == reply["revision"])
+        status = listener.list_data("status")[-1]
         LiveStatus.model_validate(status)
         assert status["counts"]["learnt"] == BATCH_ROWS
         assert status["counts"]["batches"] == 1
@@ -59,37 +57,31 @@ def test_live_rows_contain_predictions_made_before_learning(learning_service):
     assert service_of(learning_service.client).learners.live.open == 0
 
 
-def test_readers_share_events_and_leave_no_state(learning_service):
-    learning_model = learning_service.create_model("shared")
-    feed = learning_service.service.learners.live
+def test_readers_share_events_and_leave_no_state(learning_service, learning_model):
+    client, name, feed = learning_model.client, learning_model.name, learning_service.service.learners.live
     learning_model.post("observations", observation_batch(0))
-    assert "shared" not in feed._followed
-    with (
-        follow_model(learning_service.client, "shared") as one,
-        follow_model(learning_service.client, "shared") as other,
-    ):
+    assert name not in feed._followed
+    with follow_model(client, name) as one, follow_model(client, name) as other:
         assert feed.open == 2
         learning_model.post("observations", observation_batch(1))
         eventually(lambda: one.count_rows() == other.count_rows() == BATCH_ROWS)
         assert one.list_data("rows") == other.list_data("rows")
-        assert list(feed._followed) == ["shared"]
+        assert list(feed._followed) == [name]
     assert feed.open == 0
     assert not feed._followed
 
 
 @pytest.mark.slow
-def test_live_events_end_when_the_model_is_deleted(learning_service):
-    learning_service.create_model("short-lived")
-    with follow_model(learning_service.client, "short-lived") as listener:
-        assert learning_service.client.delete("/v1/models/short-lived").status_code == 204
+def test_live_events_end_when_the_model_is_deleted(learning_model):
+    with follow_model(learning_model.client, learning_model.name) as listener:
+        assert learning_model.client.delete(f"/v1/models/{learning_model.name}").status_code == 204
         eventually(lambda: listener.ended)
-    error(learning_service.client.get("/v1/models/short-lived/live"), 404, "not_found")
+    learning_model.expect_error("GET", "live", 404, "not_found")
 
 
-def test_too_many_readers_are_rejected(learning_service, monkeypatch):
-    learning_service.create_model("crowded")
+def test_too_many_readers_are_rejected(learning_service, learning_model, monkeypatch):
     monkeypatch.setattr(learning_service.service.learners.live, "open", MAX_FOLLOWERS)
-    answer = learning_service.client.get("/v1/models/crowded/live")
+    answer = learning_model.client.get(learning_model.url("live"))
     error(answer, 429, "busy")
     assert int(answer.headers["retry-after"]) > 0
 
@@ -116,21 +108,22 @@ def test_shutdown_ends_live_events(home):
         eventually(lambda: server.process.poll() is not None)
 
 
-def make_served_model(revision=0, noise=(0.1, 0.2)):
-    model = SimpleNamespace(noise_std=np.array(noise), joint_names=("a", "b"))
+NOISE_NM = np.array([0.1, 0.2])
+
+
+def make_served_model(revision=0):
+    model = SimpleNamespace(noise_std=NOISE_NM, joint_names=("a", "b"))
     return SimpleNamespace(name="arm", version=1, revision=revision, model=model, base="base")
 
 
-def make_logged_batch(count=4, codes=(), stream_id="one", of=None, seed=0, bare=0.05):
+def make_logged_batch(count, codes=(), stream_id="one", of=None, seed=0, bare=0.05):
     """Return a batch whose mean is off by 0.5 N·m; rows with a code other than contact are not predicted."""
     found: Rows = make_rows(count, seed=seed, codes=codes)
     predicted = np.isin(found.code, (0, Code.CONTACT))
     mean = found.tau[predicted] - 0.5
-    std = np.full(mean.shape, 0.3)
-    noise = np.array([0.1, 0.2])
-    screened = PredictedBatch(
-        found, slice(0, count), predicted, predicted, mean, std, np.full(mean.shape, bare), noise, 1, np.ones(2)
-    )
+    std, bare_std = np.full(mean.shape, 0.3), np.full(mean.shape, bare)
+    rows = slice(0, count)
+    screened = PredictedBatch(found, rows, predicted, predicted, mean, std, bare_std, NOISE_NM, 1, np.ones(2))
     return LoggedBatch(of or make_served_model(), stream_id, found, screened)
 
 
@@ -156,7 +149,7 @@ def test_parts_group_rows_by_stream_and_revision():
     assert reply == [("one", 0, 40, 4), ("one", 1, 20, 2), ("two", 1, 40, 4)]
     assert all(np.allclose(part.q, shown.rows.q[-1], atol=1e-6) for part, shown in parts)
     assert parts[0][0].counts == {"learnt": 37, "limit": 1, "contact": 1, "edge": 1}
-    assert np.allclose(parts[0][0].worst, 0.5 / np.hypot(0.3, [0.1, 0.2]), atol=1e-3)
+    assert np.allclose(parts[0][0].worst, 0.5 / np.hypot(0.3, NOISE_NM), atol=1e-3)
     assert sum(len(part.time) for part, _ in thin_batches(batches, 1000)) == 99
     ((part, _),) = thin_batches([make_logged_batch(2, ("limit", "limit"))], 10)
     assert (part.worst, np.isnan(part.mean).all()) == ([None, None], True)  # rows that were not predicted
@@ -170,12 +163,12 @@ def test_novelty_checks_few_doubtful_rows(monkeypatch):
         return np.arange(len(these)) % 2 == 0
 
     monkeypatch.setattr(feed, "uncovered", uncovered)
-    gathered = []
-    for seed in range(4):
-        gathered.append(thin_batches([make_logged_batch(20, seed=seed, bare=0.05)], 100)[0][1])
-    gathered.append(thin_batches([make_logged_batch(4, stream_id="two", bare=0.15)], 100)[0][1])
-    gathered.append(thin_batches([make_logged_batch(50, stream_id="three", bare=0.15)], 100)[0][1])
-    one, two, three = feed.find_novel_rows(gathered)
+    logged = [
+        *(make_logged_batch(20, seed=seed) for seed in range(4)),
+        make_logged_batch(4, stream_id="two", bare=0.15),
+        make_logged_batch(50, stream_id="three", bare=0.15),
+    ]
+    one, two, three = feed.find_novel_rows([thin_batches([batch], 100)[0][1] for batch in logged])
     assert checked_counts == [4, 17]
     assert (one.stream_id, one.times, one.unknown) == ("one", [], 0)
     assert (two.stream_id, len(two.times), two.unknown) == ("two", 2, 0)
@@ -195,9 +188,8 @@ def test_latency_quantile_is_its_bucket_bound():
 class StatusStub:
     """Replacement for the status of a model."""
 
-    def __init__(self):
-        self.calls = 0
-        self.error = None
+    calls = 0
+    error: Exception | None = None
 
     def __call__(self, novel, passed):
         self.calls += 1

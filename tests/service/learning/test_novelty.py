@@ -1,7 +1,7 @@
 """Novel motion: it raises an alarm, and a better version is trained and promoted without interruption."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from types import SimpleNamespace
@@ -42,8 +42,6 @@ def fast_batch(number: int) -> dict[str, Any]:
 
 
 pytestmark = pytest.mark.slow
-PAUSE_S = 0.01
-"""Pause between two predictions; the learner needs the processor too."""
 
 
 @contextmanager
@@ -52,7 +50,7 @@ def repeat_predictions(learning_model: LearningModel, queries: dict[str, Any]) -
     answers, end = [], threading.Event()
 
     def watch() -> None:
-        while not end.wait(PAUSE_S):
+        while not end.wait(0.01):  # the learner needs the processor too
             answers.append(learning_model.client.post(learning_model.url("predict"), json=queries))
 
     thread = threading.Thread(target=watch)
@@ -64,6 +62,10 @@ def repeat_predictions(learning_model: LearningModel, queries: dict[str, Any]) -
         thread.join(DEADLINE)
 
 
+def list_alarms(learning_model: LearningModel, kind: str) -> list[dict[str, Any]]:
+    return [each for each in learning_model.get("alarms")["items"] if each["kind"] == kind]
+
+
 @pytest.fixture(scope="module")
 def refresh_run(tmp_path_factory):
     """Everything observed from the first fast batch to the promotion."""
@@ -72,28 +74,23 @@ def refresh_run(tmp_path_factory):
         dataset = upload(api, slow_recording(), name="slow")
         train(api, "arm", dataset["id"], options=OPTIONS)
         queries = {name: getattr(fast_recording(), name)[-5:].tolist() for name in ("q", "dq", "ddq")}
-        sent = _make_sender(learning_model)
+        numbers = count()
 
-        def alarms_of(kind: str) -> list[dict[str, Any]]:
-            return [each for each in learning_model.get("alarms")["items"] if each["kind"] == kind]
+        def send() -> bool:
+            """Send the next batch and wait until it is learnt, so that a slow machine does not run out of batches."""
+            learning_model.post("observations", fast_batch(next(numbers)))
+            return eventually(lambda: learning_model.get("learning")["status"]["lag_events"] == 0)
 
         with repeat_predictions(learning_model, queries) as answers:
-            eventually(lambda: sent() and alarms_of("novelty"))
-            job = ended(api, alarms_of("novelty")[0]["evidence"]["job"])
-            eventually(lambda: sent() and answers[-1].json()["version"] == 2)
-        alarms = learning_model.get("alarms")["items"]
-        yield SimpleNamespace(
-            learning_model=learning_model,
-            learning_service=learning_service,
-            dataset=dataset,
-            job=job,
-            answers=answers,
-            alarms=alarms,
-        )
+            alarm = eventually(lambda: send() and next(iter(list_alarms(learning_model, "novelty")), None))
+            job = ended(api, alarm["evidence"]["job"])
+            eventually(lambda: send() and answers[-1].json()["version"] == 2)
+        service = learning_service.service
+        yield SimpleNamespace(learning_model=learning_model, service=service, dataset=dataset, job=job, answers=answers)
 
 
 def test_novel_motion_raises_alarm_and_trains_candidate(refresh_run):
-    [alarm] = [each for each in refresh_run.alarms if each["kind"] == "novelty"]
+    [alarm] = list_alarms(refresh_run.learning_model, "novelty")
     assert alarm["evidence"]["novel_share"] > alarm["evidence"]["threshold"] == 0.2
     assert alarm["evidence"]["version"] == 1
     assert f"{100 * alarm['evidence']['novel_share']:.0f} % of the last 2000 samples" in alarm["message"]
@@ -107,7 +104,7 @@ def test_novel_motion_raises_alarm_and_trains_candidate(refresh_run):
 
 
 def test_better_candidate_is_promoted(refresh_run):
-    [alarm] = [each for each in refresh_run.alarms if each["kind"] == "promotion"]
+    [alarm] = list_alarms(refresh_run.learning_model, "promotion")
     evidence = alarm["evidence"]
     assert (evidence["serving"], evidence["candidate"], evidence["promoted"]) == (1, 2, True)
     assert evidence["blocks"] >= 20
@@ -116,12 +113,12 @@ def test_better_candidate_is_promoted(refresh_run):
     assert read_json(refresh_run.learning_model.client.get("/v1/models/arm"))["serving_version"] == 2
     unseen = fast_recording(seed=5)
     query = {name: getattr(unseen, name)[:500].tolist() for name in ("q", "dq", "ddq")}
-    errors = {}
+    errors = []
     for version in (1, 2):
-        model = lipcore.load(_folder(refresh_run, version))
-        tau = model.predict(*query.values()).tau
-        errors[version] = np.mean((tau - unseen.tau[:500]) ** 2)
-    assert errors[2] < errors[1]
+        folder = registry.find(refresh_run.service.database, "arm", version).folder
+        tau = lipcore.load(refresh_run.service.files.version_folder(folder)).predict(*query.values()).tau
+        errors.append(np.mean((tau - unseen.tau[:500]) ** 2))
+    assert errors[1] < errors[0]
 
 
 def test_predictions_never_fail_and_versions_never_decrease(refresh_run):
@@ -129,22 +126,3 @@ def test_predictions_never_fail_and_versions_never_decrease(refresh_run):
     seen = [(answer.json()["version"], answer.json()["revision"]) for answer in refresh_run.answers]
     assert seen == sorted(seen)
     assert {version for version, _ in seen} == {1, 2}
-
-
-def _make_sender(learning_model: LearningModel) -> Callable[[], bool]:
-    """Return a function that sends the next batch and waits until it is learnt.
-
-    Waiting keeps a slow machine from reaching the end of the recording first.
-    """
-    numbers = count()
-
-    def sent() -> bool:
-        learning_model.post("observations", fast_batch(next(numbers)))
-        return eventually(lambda: learning_model.get("learning")["status"]["lag_events"] == 0)
-
-    return sent
-
-
-def _folder(refresh_run: SimpleNamespace, version: int) -> Any:
-    service = refresh_run.learning_service.service
-    return service.files.version_folder(registry.find(service.database, "arm", version).folder)

@@ -15,21 +15,19 @@ from tests.service.learning.learning_models import BATCH_ROWS, observation_batch
 
 def find_overview(client, name):
     """Return the overview of a model, read in pages of two."""
-    cursor, seen = None, []
-    while True:
-        page = read_json(client.get("/v1/overview", params={"limit": 2} | ({"cursor": cursor} if cursor else {})))
+    params, seen = {"limit": 2}, []
+    while params.get("cursor", "") is not None:
+        page = read_json(client.get("/v1/overview", params=params))
         assert len(page["items"]) <= 2
         seen += page["items"]
-        if (cursor := page["next_cursor"]) is None:
-            break
+        params["cursor"] = page["next_cursor"]
     assert len({each["name"] for each in seen}) == len(seen)
     return next(each for each in seen if each["name"] == name)
 
 
 @pytest.mark.slow
-def test_recent_window_matches_predictions(learning_service):
-    learning_model = learning_service.create_model("glanced-at")
-    before = find_overview(learning_service.client, "glanced-at")
+def test_recent_window_matches_predictions(learning_model):
+    before = find_overview(learning_model.client, learning_model.name)
     assert (before["idle_s"], before["held"], before["failure"], before["alarm"]) == (None, False, None, None)
     assert before["recent"] is None or before["recent"]["rows"] == 0
     span = learning_model.get("versions/1")["training_range"]["q"]
@@ -43,7 +41,7 @@ def test_recent_window_matches_predictions(learning_service):
         total = np.sqrt(np.square(answer["tau_std"]) + np.square(answer["noise_std"]))
         ratios.append((np.array(batch["tau"]) - answer["tau"]) / total)
         learning_model.send_batches(number)
-    seen, quality = find_overview(learning_service.client, "glanced-at"), learning_model.get("quality")
+    seen, quality = find_overview(learning_model.client, learning_model.name), learning_model.get("quality")
     recent = seen["recent"]
     window = next(each for each in quality["windows"] if each["seconds"] == recent["seconds"] == 3600)
     assert (recent["rows"], recent["nmse"], recent["coverage"]) == (3 * BATCH_ROWS, window["nmse"], window["coverage"])
@@ -73,13 +71,13 @@ def test_overview_loads_no_model(learning_service):
     assert set(learning_service.service.loaded.versions()) == loaded
 
 
-def test_overview_shows_pauses_and_alarms(learning_service):
-    learning_model = learning_service.create_model("hesitant")
-    with learning_service.service.database.transaction("hesitant") as session:
-        owner.pause(session, "hesitant", {"at": 1.0})
-        raise_alarm(session, "hesitant", "novelty", "the first", {})
-        raise_alarm(session, "hesitant", "change", "the newest", {"joint": 1})
-    seen = find_overview(learning_service.client, "hesitant")
+def test_overview_shows_pauses_and_alarms(learning_service, learning_model):
+    name = learning_model.name
+    with learning_service.service.database.transaction(name) as session:
+        owner.pause(session, name, {"at": 1.0})
+        raise_alarm(session, name, "novelty", "the first", {})
+        raise_alarm(session, name, "change", "the newest", {"joint": 1})
+    seen = find_overview(learning_service.client, name)
     assert seen["held"]
     assert seen["alarm"] == learning_model.get("alarms")["items"][0]
     assert seen["alarm"]["message"] == "the newest"
@@ -88,13 +86,12 @@ def test_overview_shows_pauses_and_alarms(learning_service):
 def test_overview_shows_the_arm_of_the_version(learning_service):
     seen = find_overview(learning_service.client, "panda-sim")
     version = read_json(learning_service.client.get("/v1/models/panda-sim/versions/1"))
-    bodies = version["parameters"]["inertia"]["bodies"]
-    assert [each["joint"] for each in seen["arm"]["joints"]] == version["parameters"]["geometry"]["order"]
-    for sketched, learnt in zip(seen["arm"]["joints"], version["parameters"]["geometry"]["joints"], strict=True):
+    bodies, geometry = version["parameters"]["inertia"]["bodies"], version["parameters"]["geometry"]
+    assert [each["joint"] for each in seen["arm"]["joints"]] == geometry["order"]
+    for sketched, learnt in zip(seen["arm"]["joints"], geometry["joints"], strict=True):
         assert version["joint_names"][sketched["joint"]] == learnt["joint"]
-        assert {name: sketched[name] for name in ("rotation", "translation", "axis", "type")} == {
-            name: learnt[name] for name in ("rotation", "translation", "axis", "type")
-        }
+        for name in ("rotation", "translation", "axis", "type"):
+            assert sketched[name] == learnt[name]
         body = bodies[sketched["joint"]]["plausible"]
         assert np.multiply(sketched["centre"], sketched["mass"]) == pytest.approx(body["first_moment"])
     assert len(seen["position"]) == 7

@@ -123,7 +123,9 @@ def test_model_without_arm_has_no_payload(learning_service, streaming):
     with follow_model(learning_service.client, "armless") as listener:
         assert listener.list_data("status")[0]["payloads"] is None
     with Client(streaming.server.url) as client:
-        assert "has no arm" in client.payload("pendulum").reason
+        shown = client.payload("pendulum")
+        assert shown.streams == []
+        assert "has no arm" in shown.reason
         with pytest.raises(ApiError) as caught:
             client.declare_payload("pendulum", 1.0, [0.0, 0.0, 0.1])
         assert (caught.value.status, caught.value.code) == (409, "conflict")

@@ -33,10 +33,15 @@ from tests.service.learning.pendulums import (
 )
 
 
+def start_loading(arm):
+    """Return the loaded models of a service that has just started: none."""
+    return LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
+
+
 @pytest.fixture
 def loaded_models(arm):
     """Loaded models of a service, with the model as trained."""
-    found = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
+    found = start_loading(arm)
     found.get(ARM, None)
     return found
 
@@ -49,19 +54,21 @@ def make_revision(batches, floor=None):
     return Revision.of(online.model(floor))
 
 
-def make_publication(arm, batches, number=None, **fields):
-    """Return the learner's message that publishes a revision."""
+def publish_revision(arm, loaded_models, batches, number=None):
+    """Publish the revision after some batches, as the learner does; return whether it is adopted for predictions."""
     path = publication.write(publication.clear(arm.files), make_revision(batches))
     number = batches if number is None else number
-    defaults = {
-        "model": ARM,
-        "version": 1,
-        "revision": number,
-        "number": number,
-        "path": path,
-        "samples": 10.0 * batches,
-    }
-    return Publication(**defaults | {"novel_rows": 0, "novel_share": 0.0, "seconds": 0.1, "at": 0.0} | fields)
+    return adopt_revision(loaded_models, Publication(ARM, 1, number, number, path, 10.0 * batches, 0, 0.0, 0.1, 0.0))
+
+
+def evict_model(arm, loaded_models):
+    """Load other models until this one is evicted."""
+    for number in range(loaded_models.capacity):
+        other = f"other-{number}"
+        if other not in {name for name, _ in loaded_models._snapshot.served}:
+            arm.publish(other)
+        loaded_models.get(other, None)
+    assert loaded_models.hot(ARM, None) is None
 
 
 def test_published_arrays_are_read_once(arm):
@@ -75,45 +82,45 @@ def test_published_arrays_are_read_once(arm):
 
 
 def test_adopted_revision_is_used_for_predictions(arm, loaded_models):
-    before = loaded_models.hot(ARM, None)
-    assert adopt_revision(loaded_models, make_publication(arm, 3))
+    before, expected = loaded_models.hot(ARM, None), expected_predictions(range(3))
+    assert publish_revision(arm, loaded_models, 3)
     after = loaded_models.hot(ARM, None)
     assert (before.revision, after.revision, after.version) == (0, 3, 1)
-    assert_predictions(after.model, expected_predictions(range(3)))
+    assert_predictions(after.model, expected)
     assert_predictions(before.model, expected_predictions())
-    assert predictions_differ(expected_predictions(range(3)), expected_predictions())
+    assert predictions_differ(expected, expected_predictions())
     assert loaded_models.hot(ARM, 1) is after
     assert after.base is before.base
     single = [after.model.answer(np.ascontiguousarray(QUERIES[:, row])) for row in range(QUERIES.shape[1])]
-    np.testing.assert_allclose([tau for tau, _ in single], expected_predictions(range(3))[0], rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose([std for _, std in single], expected_predictions(range(3))[1], rtol=1e-8, atol=1e-8)
+    for found, values in zip(zip(*single, strict=True), expected, strict=True):
+        np.testing.assert_allclose(found, values, rtol=1e-8, atol=1e-8)
 
 
 def test_only_higher_revisions_are_adopted(arm, loaded_models):
-    assert adopt_revision(loaded_models, make_publication(arm, 3))
+    assert publish_revision(arm, loaded_models, 3)
     known = loaded_models.hot(ARM, None)
     for number in (2, 3):
-        assert not adopt_revision(loaded_models, make_publication(arm, 5, number=number))
+        assert not publish_revision(arm, loaded_models, 5, number=number)
         assert loaded_models.hot(ARM, None) is known
-    assert adopt_revision(loaded_models, make_publication(arm, 1, number=4))  # a rollback has a higher revision
+    assert publish_revision(arm, loaded_models, 1, number=4)  # a rollback has a higher revision
     assert_predictions(loaded_models.hot(ARM, None).model, expected_predictions(range(1)))
     assert loaded_models.hot(ARM, None).revision == 4
 
 
 def test_reloaded_version_has_its_learnt_state(arm, loaded_models):
-    adopt_revision(loaded_models, make_publication(arm, 3))
+    publish_revision(arm, loaded_models, 3)
     evict_model(arm, loaded_models)
     again = loaded_models.get(ARM, None)
     assert again.revision == 3
     assert_predictions(again.model, expected_predictions(range(3)))
-    adopt_revision(loaded_models, make_publication(arm, 5))
+    publish_revision(arm, loaded_models, 5)
     assert_predictions(loaded_models.hot(ARM, None).model, expected_predictions(range(5)))
 
 
 def test_evicted_version_held_by_a_stream_keeps_learning(arm, loaded_models):
     held = loaded_models.get(ARM, None)
     evict_model(arm, loaded_models)
-    assert adopt_revision(loaded_models, make_publication(arm, 4))
+    assert publish_revision(arm, loaded_models, 4)
     assert loaded_models.hot(ARM, None).revision == 4
     assert loaded_models.hot(ARM, None).base is held.base
     assert len(loaded_models._snapshot.served) == loaded_models.capacity
@@ -121,7 +128,7 @@ def test_evicted_version_held_by_a_stream_keeps_learning(arm, loaded_models):
 
 def test_started_service_restores_from_the_log(arm):
     arm.log_batches(*range(4))
-    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
+    started = start_loading(arm)
     assert started.preload() == 1
     found = started.hot(ARM, None)
     assert found.revision == 4
@@ -135,7 +142,7 @@ def test_revision_published_during_loading_is_kept(arm, loaded_models, monkeypat
 
     def publish_while_loading(*given):
         model = load(*given)
-        assert not adopt_revision(loaded_models, make_publication(arm, 4))
+        assert not publish_revision(arm, loaded_models, 4)
         return model
 
     monkeypatch.setattr(Files, "load_version", publish_while_loading)
@@ -146,7 +153,7 @@ def test_revision_published_during_loading_is_kept(arm, loaded_models, monkeypat
 def test_learner_is_woken_for_partially_restored_version(arm, monkeypatch):
     monkeypatch.setattr(learnt, "MAX_PAGES", 0)
     woken = []
-    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
+    started = start_loading(arm)
     arm.log_batches(*range(4))
     started.preload()
     started.learn_from(woken.append)
@@ -161,7 +168,7 @@ def test_unreadable_log_leaves_version_as_trained(arm, caplog):
     arm.log_batches(0)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("UPDATE events SET payload = x'00'")
-    started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
+    started = start_loading(arm)
     started.preload()
     found = started.hot(ARM, None)
     assert found.revision == 0
@@ -170,9 +177,9 @@ def test_unreadable_log_leaves_version_as_trained(arm, caplog):
 
 
 def test_replaced_revisions_are_freed(arm, loaded_models):
-    adopt_revision(loaded_models, make_publication(arm, 1))
+    publish_revision(arm, loaded_models, 1)
     first = weakref.ref(loaded_models.hot(ARM, None).model)
-    adopt_revision(loaded_models, make_publication(arm, 2))
+    publish_revision(arm, loaded_models, 2)
     gc.collect()
     assert first() is None
 
@@ -184,28 +191,24 @@ def test_predictions_are_consistent_while_revisions_change(arm, loaded_models):
     motion = np.ascontiguousarray(QUERIES[:, 7])
     expected = {0: trained_model().answer(motion)}
     expected |= {n: each.apply(trained_model()).answer(motion) for n, each in enumerate(revisions, start=1)}
-    answers, failed, stop = [[] for _ in range(3)], [], threading.Event()
+    answers, stop = [[] for _ in range(3)], threading.Event()
 
     def predict_until_stopped(into):
-        try:
-            while not stop.is_set():
-                served = loaded_models.hot(ARM, None)
-                into.append((served.revision, *served.model.answer(motion)))
-        except Exception as error:
-            failed.append(error)
+        while not stop.is_set():
+            served = loaded_models.hot(ARM, None)
+            into.append((served.revision, *served.model.answer(motion)))
 
-    threads = [threading.Thread(target=predict_until_stopped, args=(into,)) for into in answers]
-    for thread in threads:
-        thread.start()
-    for number in range(1, 9):
-        loaded_models.revise(ARM, 1, number, revisions[number - 1])
-        known = [len(each) for each in answers]  # of three more predictions, at least two began after the revision
-        while any(len(each) < before + 3 for each, before in zip(answers, known, strict=True)) and not failed:
-            pass
-    stop.set()
-    for thread in threads:
-        thread.join()
-    assert not failed
+    with ThreadPoolExecutor(len(answers)) as threads:
+        running = [threads.submit(predict_until_stopped, into) for into in answers]
+        for number in range(1, 9):
+            loaded_models.revise(ARM, 1, number, revisions[number - 1])
+            known = [len(each) for each in answers]  # of three more predictions, at least two began after the revision
+            while any(len(each) < before + 3 for each, before in zip(answers, known, strict=True)):
+                if any(each.done() for each in running):  # a thread failed
+                    break
+        stop.set()
+    for each in running:
+        each.result()
     for each in answers:
         numbers = [number for number, _, _ in each]
         assert numbers == sorted(numbers)
@@ -217,39 +220,20 @@ def test_predictions_are_consistent_while_revisions_change(arm, loaded_models):
     assert len({float(tau[0]) for tau, _ in expected.values()}) == 9
 
 
-def evict_model(arm, loaded_models):
-    """Load other models until this one is evicted."""
-    for number in range(loaded_models.capacity):
-        other = f"other-{number}"
-        if other not in {name for name, _ in loaded_models._snapshot.served}:
-            arm.publish(other)
-        loaded_models.get(other, None)
-    assert loaded_models.hot(ARM, None) is None
-
-
 SINGLE_QUERY = {name: rows[0] for name, rows in HTTP_QUERIES.items()}
 
 
 def test_min_revision_is_waited_for(learning_model):
     learning_model.predict()
-    reply = learning_model.post("observations", observation_batch(0))
+    revision, url = learning_model.post("observations", observation_batch(0))["revision"], learning_model.url("predict")
+    queries = [query | {"min_revision": revision} for query in (SINGLE_QUERY, HTTP_QUERIES)]
     with ThreadPoolExecutor(2) as threads:  # single queries wait in the event loop, batches in a thread
-        requests = [
-            threads.submit(
-                learning_model.client.post,
-                learning_model.url("predict"),
-                json=query | {"min_revision": reply["revision"]},
-            )
-            for query in (SINGLE_QUERY, HTTP_QUERIES)
-        ]
-        answers = [each.result() for each in requests]
+        answers = list(threads.map(lambda query: learning_model.client.post(url, json=query), queries))
     # a learner that is still starting may take longer than the wait
     assert all(each.status_code in (200, 503) for each in answers)
-    learning_model.wait_for_revision(reply["revision"])
-    for query in (SINGLE_QUERY, HTTP_QUERIES):
-        assert (
-            learning_model.post("predict", query | {"min_revision": reply["revision"]})["revision"] == reply["revision"]
-        )
+    learning_model.wait_for_revision(revision)
+    for query in queries:
+        assert learning_model.post("predict", query)["revision"] == revision
 
 
 def test_unreached_min_revision_is_an_error(learning_model, monkeypatch):
@@ -268,16 +252,14 @@ def test_unreached_min_revision_is_an_error(learning_model, monkeypatch):
 def test_evaluation_waits_for_min_revision(learning_model, monkeypatch):
     monkeypatch.setitem(vars(service_of(learning_model.client).settings), "min_revision_wait_s", 0.05)
     body = {"dataset": "ds_0", "min_revision": 1}
-    error(learning_model.client.post(learning_model.url("evaluate"), json=body), 503, "revision_not_reached")
+    learning_model.expect_error("POST", "evaluate", 503, "revision_not_reached", json=body)
     learning_model.expect_error("POST", "evaluate", 404, "not_found", json=body | {"min_revision": 0})
 
 
-def test_unknown_versions_are_not_waited_for(learning_service, learning_model):
-    learning_model.expect_error(
-        "POST", "predict", 404, "not_found", json=HTTP_QUERIES | {"min_revision": 1, "version": 9}
-    )
-    answer = learning_service.client.post("/v1/models/nobody/predict", json=HTTP_QUERIES | {"min_revision": 1})
-    error(answer, 404, "not_found")
+def test_unknown_versions_are_not_waited_for(learning_model):
+    query = HTTP_QUERIES | {"min_revision": 1}
+    learning_model.expect_error("POST", "predict", 404, "not_found", json=query | {"version": 9})
+    error(learning_model.client.post("/v1/models/nobody/predict", json=query), 404, "not_found")
 
 
 def test_waiters_miss_no_wakeup_and_are_removed():

@@ -16,8 +16,6 @@ from service.learning.ingest.monitor import WINDOWS_S
 from tests.service.data import eventually
 from tests.service.learning.learning_models import observation_batch
 
-FIGURES = ("nmse", "rmse", "coverage", "nlpd")
-
 
 def compute_figures(batches, answers):
     """Return the four figures of all rows against earlier predictions, computed from their definitions."""
@@ -35,23 +33,23 @@ def compute_figures(batches, answers):
 
 
 @pytest.mark.slow
-def test_rows_are_predicted_before_they_are_learnt(learning_service):
-    learning_model = learning_service.create_model("prequential")
+def test_rows_are_predicted_before_they_are_learnt(learning_model):
     batches, answers = [observation_batch(number) for number in range(3)], []
-    for number, batch in enumerate(batches):
-        answers.append(learning_model.predict({name: batch[name] for name in ("q", "dq", "ddq")}))
+    queries = [{name: batch[name] for name in ("q", "dq", "ddq")} for batch in batches]
+    for number, query in enumerate(queries):
+        answers.append(learning_model.predict(query))
         assert answers[-1]["revision"] == number
         learning_model.send_batches(number)
     expected = compute_figures(batches, answers)
     seen = learning_model.get("quality")
-    assert (seen["model"], seen["version"], seen["revision"], seen["level"]) == ("prequential", 1, 3, 0.95)
+    assert (seen["model"], seen["version"], seen["revision"], seen["level"]) == (learning_model.name, 1, 3, 0.95)
     assert seen["joint_names"] == ["joint1", "joint2"]
     assert [window["seconds"] for window in seen["windows"]] == list(WINDOWS_S)
     for window in seen["windows"]:
         assert (window["rows"], window["accepted"], window["rejected"]) == (30, 30, {})
-        for name in FIGURES:
-            assert window[name] == pytest.approx(expected[name], rel=1e-9), name
-    after = learning_model.predict({name: batches[0][name] for name in ("q", "dq", "ddq")})
+        for name, figures in expected.items():
+            assert window[name] == pytest.approx(figures, rel=1e-9), name
+    after = learning_model.predict(queries[0])
     late, early = (np.abs(np.subtract(answer["tau"], batches[0]["tau"])).mean() for answer in (after, answers[0]))
     assert late < early  # predictions after learning would flatter
 
@@ -82,10 +80,9 @@ def scrape_metrics(learning_service, model):
     return samples
 
 
-def test_metrics_match_the_quality_route(learning_service):
-    learning_model = learning_service.create_model("scraped")
+def test_metrics_match_the_quality_route(learning_service, learning_model):
     learning_model.send_batches(0, 1)
-    samples, seen = scrape_metrics(learning_service, "scraped"), learning_model.get("quality")
+    samples, seen = scrape_metrics(learning_service, learning_model.name), learning_model.get("quality")
     for window in seen["windows"]:
         for name in ("nmse", "coverage", "nlpd"):
             for joint, value in zip(seen["joint_names"], window[name], strict=True):
@@ -96,8 +93,7 @@ def test_metrics_match_the_quality_route(learning_service):
     assert samples["lipserve_novel_share",] == learning_model.get("learning")["status"]["novel_share"]
 
 
-def test_row_outcomes_are_counted_and_unknown_figures_left_out(learning_service):
-    learning_model = learning_service.create_model("rows")
+def test_row_outcomes_are_counted_and_unknown_figures_left_out(learning_service, learning_model):
     body = observation_batch(0)
     body["tau"] = [[row[0], 0.25] for row in body["tau"]]  # constant torque has no NMSE
     body["q"][2][0], body["q"][5][1], body["dq"][7][0] = None, 1000.0, 1000.0
@@ -107,23 +103,22 @@ def test_row_outcomes_are_counted_and_unknown_figures_left_out(learning_service)
         assert (window["rows"], window["accepted"], window["rejected"]) == (7, 7, {"non_finite": 1, "limit": 2})
         assert [value is None for value in window["nmse"]] == [False, True]
         assert None not in window["rmse"] + window["coverage"] + window["nlpd"]
-    samples = scrape_metrics(learning_service, "rows")
-    counted = {
-        dict(key[1:])["outcome"]: value for key, value in samples.items() if key[0] == "lipserve_observations_total"
-    }
+    samples = scrape_metrics(learning_service, learning_model.name)
+    metric = "lipserve_observations_total"
+    counted = {dict(labels)["outcome"]: samples[name, *labels] for name, *labels in samples if name == metric}
     assert counted == dict.fromkeys(CODES, 0) | {"learnt": 7, "non_finite": 1, "limit": 2}
-    assert {dict(key[1:])["joint"] for key in samples if key[0] == "lipserve_quality_nmse"} == {"joint1"}
+    assert {dict(labels)["joint"] for name, *labels in samples if name == "lipserve_quality_nmse"} == {"joint1"}
 
 
-def test_lag_counts_rows_not_learnt_yet(learning_service):
-    learning_model = learning_service.create_model("lagging")
+def test_lag_counts_rows_not_learnt_yet(learning_service, learning_model):
     learning_model.send_batches(0)
     learner = learning_service.service.learners.process.pid
     os.kill(learner, signal.SIGSTOP)
     try:
         for number in (1, 2):
             learning_model.post("observations", observation_batch(number))
-        samples, status = scrape_metrics(learning_service, "lagging"), learning_model.get("learning")["status"]
+        samples = scrape_metrics(learning_service, learning_model.name)
+        status = learning_model.get("learning")["status"]
     finally:
         os.kill(learner, signal.SIGCONT)
     assert samples["lipserve_learning_lag_rows",] == status["lag_rows"] == 20

@@ -5,7 +5,6 @@ from datetime import UTC, datetime
 from unittest.mock import patch
 
 import pytest
-from sqlalchemy import select
 
 from lipserve.states import CANCELLED, FAILED, RUNNING
 from service.journal import log
@@ -30,49 +29,40 @@ def idle_jobs_service(learning_service, monkeypatch):
         yield learning_service
 
 
+def accept_job(client, path):
+    """Return the job that a request queues."""
+    answer = client.post(path, json={})
+    assert answer.status_code == 202, answer.text
+    job = answer.json()
+    assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
+    return job
+
+
+def request_refresh(learning_model):
+    return accept_job(learning_model.client, learning_model.url("refresh"))
+
+
 def cancel_job(learning_model, job):
     assert learning_model.client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 200
 
 
-def read_start(learning_service, model, version):
-    with learning_service.service.database.session() as session:
-        return log.start_of(session, model, version)
-
-
-@pytest.fixture(scope="module")
-def refresh_result(learning_service):
-    """Model with a data set, observations and a requested refresh; returns model, data set and job."""
+@pytest.mark.slow
+def test_refresh_of_few_rows_is_a_candidate_with_the_options_of_the_version(learning_service):
     learning_model = LearningModel(learning_service.client, "asked")
-    dataset = upload(learning_service.client, stream(), name="recorded")
-    train(
-        learning_service.client, learning_model.name, dataset["id"], robot=None, options={**QUICK, "max_iterations": 5}
-    )
+    client, url = learning_model.client, f"/v1/models/{learning_model.name}"
+    dataset = upload(client, stream(), name="recorded")["id"]
+    train(client, learning_model.name, dataset, robot=None, options={**QUICK, "max_iterations": 5})
     learning_model.put("learning", {"contact_threshold": 100.0, "on_change": "learn", "auto_refresh": False})
     learning_model.send_batches(0, 1, 2, 3)
-    answer = learning_service.client.post(learning_model.url("refresh"), json={})
-    assert answer.status_code == 202, answer.text
-    job = answer.json()
-    assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
-    return learning_model, dataset, ended(learning_service.client, job["id"])
-
-
-@pytest.mark.slow
-def test_refresh_with_too_few_rows_stays_candidate(learning_service, refresh_result):
-    learning_model, dataset, job = refresh_result
-    assert (job["state"], job["version"], job["datasets"]) == ("succeeded", 2, [dataset["id"]])
+    job = ended(client, request_refresh(learning_model)["id"])
+    assert (job["state"], job["version"], job["datasets"]) == ("succeeded", 2, [dataset])
     assert job["refresh"] == {"version": 1, "through": 4, "trigger": "asked"}
-    shown = read_json(learning_service.client.get(f"/v1/models/{learning_model.name}"))
+    shown = read_json(client.get(url))
     assert (shown["latest_version"], shown["serving_version"]) == (2, 1)
-    assert read_start(learning_service, learning_model.name, 2) == 4
+    with learning_service.service.database.session() as session:
+        assert log.start_of(session, learning_model.name, 2) == 4
 
-
-@pytest.mark.slow
-def test_refresh_uses_the_options_of_the_version(learning_service, refresh_result):
-    learning_model, _, _ = refresh_result
-    old, new = (
-        read_json(learning_service.client.get(f"/v1/models/{learning_model.name}/versions/{number}"))
-        for number in (1, 2)
-    )
+    old, new = (read_json(client.get(f"{url}/versions/{number}")) for number in (1, 2))
     for name in ("estimator", "joint_names", "joint_types", "torque_convention", "options"):
         assert new[name] == old[name]
     assert new["lineage"]["datasets"] == old["lineage"]["datasets"]
@@ -85,8 +75,7 @@ def test_refresh_uses_the_options_of_the_version(learning_service, refresh_resul
 def test_second_refresh_is_rejected_while_one_is_queued(idle_jobs_service, learning_model):
     learning_model.send_batches(0, 1, 2)
     job = request_refresh(learning_model)
-    reply = learning_model.expect_error("POST", "refresh", 409, "conflict", json={})
-    assert job["id"] in reply["message"]
+    assert job["id"] in learning_model.expect_error("POST", "refresh", 409, "conflict", json={})["message"]
     cancel_job(learning_model, job)
     cancel_job(learning_model, request_refresh(learning_model))
 
@@ -95,40 +84,32 @@ def test_refresh_replaces_obsolete_gpu_option(idle_jobs_service, learning_model)
     """Earlier releases trained every estimator with `device: "cuda"`."""
     learning_model.send_batches(0, 1, 2)
     with idle_jobs_service.service.database.transaction() as session:
-        version = session.scalars(select(VersionRow).where(VersionRow.model == learning_model.name)).one()
+        version = session.get_one(VersionRow, (learning_model.name, 1))
         version.manifest = {**version.manifest, "options": {**version.manifest["options"], "device": "cuda"}}
     job = request_refresh(learning_model)
     with idle_jobs_service.service.database.session() as session:
-        row = session.scalars(select(JobRow).where(JobRow.id == job["id"])).one()
+        row = session.query(JobRow).filter_by(id=job["id"]).one()
         assert row.request["options"]["device"] == "auto"
     cancel_job(learning_model, job)
 
 
-def request_refresh(learning_model):
-    answer = learning_model.client.post(learning_model.url("refresh"), json={})
-    assert answer.status_code == 202, answer.text
-    return answer.json()
-
-
 def test_refresh_without_data_is_rejected(learning_model):
     learning_model.send_batches(0, 1)
-    reply = learning_model.expect_error("POST", "refresh", 409, "conflict", json={})
-    assert "20 rows" in reply["message"]
-    assert "at least 30" in reply["message"]
-    assert "it has been deleted" in reply["message"]
+    message = learning_model.expect_error("POST", "refresh", 409, "conflict", json={})["message"]
+    for words in ("20 rows", "at least 30", "it has been deleted"):
+        assert words in message
 
 
 def test_unlearning_during_training_fails_the_job(idle_jobs_service, learning_model, monkeypatch):
     learning_model.send_batches(0, 1, 2, 3)
-    job, service = request_refresh(learning_model), idle_jobs_service.service
-    fit = planned_fit.fit_model
+    job, fit = request_refresh(learning_model), planned_fit.fit_model
 
     def fit_after_unlearning(*given, **more):
         learning_model.delete("observations/arm/1")
         return fit(*given, **more)
 
     monkeypatch.setattr(planned_fit, "fit_model", fit_after_unlearning)
-    worker.run(service.settings, job["id"])
+    worker.run(idle_jobs_service.service.settings, job["id"])
     seen = read_json(learning_model.client.get(f"/v1/jobs/{job['id']}"))
     assert (seen["state"], seen["error"]["code"]) == ("failed", "observations_taken_back")
     assert read_json(learning_model.client.get(f"/v1/models/{learning_model.name}"))["latest_version"] == 1
@@ -139,9 +120,7 @@ def test_retried_refresh_uses_the_current_log(idle_jobs_service, learning_model)
     job = request_refresh(learning_model)
     learning_model.send_batches(3)
     cancel_job(learning_model, job)
-    answer = learning_model.client.post(f"/v1/jobs/{job['id']}/retry")
-    assert answer.status_code == 202, answer.text
-    again = answer.json()
+    again = accept_job(learning_model.client, f"/v1/jobs/{job['id']}/retry")
     assert again["retry_of"] == job["id"]
     assert again["refresh"] == {**job["refresh"], "through": job["refresh"]["through"] + 1}
     reply = learning_model.client.post(f"/v1/jobs/{job['id']}/retry").json()["error"]
@@ -171,24 +150,16 @@ def test_refresh_continues_after_service_kill(tmp_path):
         assert lineage["log"]["rows"] == 40
 
 
-def make_publication(learning_model, share=0.5, version=1, errors=None):
-    return Publication(learning_model.name, version, 3, 3, None, 30.0, 900, share, 0.1, time.time(), errors)
-
-
-def consider_refresh(learning_service, learning_model, **changes):
+def consider_refresh(learning_service, learning_model, share=0.5, version=1, errors=None, pause=0.0, observed=0.0):
+    """Consider a refresh after a publication; return the job, if any. By default few rows are enough, at any time."""
     service = learning_service.service
-    with patch.object(refresh, "RULE", RefreshRule(pause_s=changes.pop("pause", 0.0))):
-        return refresh.queue_refresh(service.database, service.jobs, make_publication(learning_model, **changes))
+    published = Publication(learning_model.name, version, 3, 3, None, 30.0, 900, share, 0.1, time.time(), errors)
+    with patch.multiple(refresh, RULE=RefreshRule(pause_s=pause), MIN_OBSERVED_S=observed):
+        return refresh.queue_refresh(service.database, service.jobs, published)
 
 
 def list_alarms(learning_model):
     return [(each["kind"], each["message"]) for each in learning_model.get("alarms")["items"]]
-
-
-@pytest.fixture(autouse=True)
-def no_min_observed_time(monkeypatch):
-    """Allow automatic refreshes after few rows."""
-    monkeypatch.setattr(refresh, "MIN_OBSERVED_S", 0.0)
 
 
 @pytest.fixture
@@ -203,32 +174,28 @@ def refreshable_model(idle_jobs_service, learning_model):
 
 
 def test_novel_motion_triggers_one_refresh_and_one_alarm(refreshable_model):
+    learning_service, learning_model = refreshable_model
+    with learning_service.service.database.session() as session:
+        newest = log.newest(session, learning_model.name)
     job = consider_refresh(*refreshable_model)
-    assert job.refresh.model_dump() == {
-        "version": 1,
-        "through": read_newest_event(*refreshable_model),
-        "trigger": "novelty",
-    }
-    [(kind, message)] = list_alarms(refreshable_model[1])
+    assert job.refresh.model_dump() == {"version": 1, "through": newest, "trigger": "novelty"}
+    assert consider_refresh(*refreshable_model) is None
+    [(kind, message)] = list_alarms(learning_model)
     assert kind == "novelty"
     assert "50 % of the last 2000 samples" in message
-    assert consider_refresh(*refreshable_model) is None
-    assert len(list_alarms(refreshable_model[1])) == 1
 
 
-def read_newest_event(learning_service, learning_model):
-    with learning_service.service.database.session() as session:
-        return log.newest(session, learning_model.name)
-
-
-@pytest.mark.parametrize("changes", [{"share": 0.2}, {"version": 2}])
-def test_little_novelty_or_another_version_triggers_nothing(refreshable_model, changes):
-    assert consider_refresh(*refreshable_model, **changes) is None
+@pytest.mark.parametrize(
+    "circumstances",
+    [{"share": 0.2}, {"version": 2}, {"observed": 60.0}, {"share": 0.0, "errors": (0.1, 0.4)}],
+    ids=["little novelty", "another version", "few observations", "small linearisation error"],
+)
+def test_no_refresh_without_reason(refreshable_model, circumstances):
+    assert consider_refresh(*refreshable_model, **circumstances) is None
     assert list_alarms(refreshable_model[1]) == []
 
 
 def test_large_linearisation_error_triggers_refresh(refreshable_model):
-    assert consider_refresh(*refreshable_model, share=0.0, errors=(0.1, 0.4)) is None
     job = consider_refresh(*refreshable_model, share=0.0, errors=(0.1, 0.8))
     assert job.refresh.trigger == "linearisation"
     [alarm] = refreshable_model[1].get("alarms")["items"]
@@ -248,26 +215,18 @@ def test_paused_model_is_not_refreshed(refreshable_model):
     assert consider_refresh(learning_service, learning_model) is not None
 
 
-def test_version_with_few_observations_is_not_refreshed(refreshable_model, monkeypatch):
-    monkeypatch.setattr(refresh, "MIN_OBSERVED_S", 60.0)
-    assert consider_refresh(*refreshable_model) is None
-
-
 def test_pauses_between_refreshes_grow(refreshable_model):
-    learning_service, learning_model = refreshable_model
-
-    def finish_job(job, state, seconds):
-        at = datetime.fromtimestamp(time.time() - seconds, UTC).isoformat()
-        with learning_service.service.database.transaction() as session:
+    def finish_job(job, state):
+        """End a job as of 500 s ago."""
+        with refreshable_model[0].service.database.transaction() as session:
             row = session.query(JobRow).filter_by(id=job.id).one()
-            row.state, row.finished_at = state, at
+            row.state, row.finished_at = state, datetime.fromtimestamp(time.time() - 500.0, UTC).isoformat()
 
-    finish_job(consider_refresh(learning_service, learning_model), FAILED, 500.0)
-    assert consider_refresh(learning_service, learning_model, pause=600.0) is None
-    second = consider_refresh(learning_service, learning_model, pause=400.0)
-    finish_job(second, CANCELLED, 500.0)
-    assert consider_refresh(learning_service, learning_model, pause=400.0) is None
-    assert consider_refresh(learning_service, learning_model, pause=240.0) is not None
+    finish_job(consider_refresh(*refreshable_model), FAILED)
+    assert consider_refresh(*refreshable_model, pause=600.0) is None
+    finish_job(consider_refresh(*refreshable_model, pause=400.0), CANCELLED)
+    assert consider_refresh(*refreshable_model, pause=400.0) is None
+    assert consider_refresh(*refreshable_model, pause=240.0) is not None
 
 
 def test_impossible_refresh_raises_one_alarm(idle_jobs_service, learning_model):

@@ -42,6 +42,12 @@ def learn_seconds(seconds: int):
     return online.model()
 
 
+def compare_model(arm, seconds, rows):
+    """Compare the model that has learnt these seconds with version 1."""
+    serving = registry.find(arm.database, ARM, 1)
+    return refreshed.compare(arm.database, arm.files, serving, learn_seconds(seconds), rows)
+
+
 @pytest.mark.parametrize(
     ("seconds", "passed", "words"),
     [
@@ -51,10 +57,7 @@ def learn_seconds(seconds: int):
     ],
 )
 def test_candidate_is_accepted_if_it_predicts_newest_rows_better(arm, seconds, passed, words):
-    serving = registry.find(arm.database, ARM, 1)
-    found = refreshed.compare(
-        arm.database, arm.files, serving, learn_seconds(seconds), make_comparison_rows(*range(TRAINED_EVENTS, 26))
-    )
+    found = compare_model(arm, seconds, make_comparison_rows(*range(TRAINED_EVENTS, 26)))
     assert (found.acceptance.passed, words in found.acceptance.reason) == (passed, True)
     assert (found.evidence["rows"], found.evidence["blocks"]) == (22 * SECOND_ROWS, 22)
     better = found.evidence["gain"] > 2 * found.evidence["standard_error"]
@@ -63,13 +66,10 @@ def test_candidate_is_accepted_if_it_predicts_newest_rows_better(arm, seconds, p
 
 
 def test_too_few_rows_give_no_verdict(arm):
-    serving = registry.find(arm.database, ARM, 1)
-    for few in (None, make_comparison_rows(4, 5, 6)):
-        found = refreshed.compare(arm.database, arm.files, serving, learn_seconds(14), few)
-        assert (found.acceptance.passed, found.acceptance.reason) == (
-            None,
-            "not compared with version 1, because too few rows are logged",
-        )
+    for rows in (None, make_comparison_rows(4, 5, 6)):
+        acceptance = compare_model(arm, 14, rows).acceptance
+        assert acceptance.passed is None
+        assert acceptance.reason == "not compared with version 1, because too few rows are logged"
 
 
 def test_newest_third_of_learnt_rows_is_compared(arm):

@@ -21,6 +21,19 @@ from tests.service.learning.pendulums import (
 from tests.system.faults.damage import cut, flip, remove
 
 
+def delete_events(arm, last):
+    """Delete the events up to a number, without regard to retention."""
+    with arm.database.transaction() as session:
+        session.connection().exec_driver_sql(f"DELETE FROM events WHERE number <= {last}")
+
+
+def assert_loaded(arm, revision, is_behind):
+    """Check what a loaded version has learnt: the batches up to a revision."""
+    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
+    assert (found.revision, found.behind) == (revision, is_behind)
+    assert_predictions(found.model, expected_predictions(range(revision)))
+
+
 def test_page_has_at_least_one_batch_and_limited_rows(arm, monkeypatch):
     monkeypatch.setattr(restoring, "PAGE_ROWS", 25)
     arm.log_batches(0, 1, 2)
@@ -50,10 +63,9 @@ def test_snapshot_does_not_change_the_result(arm, pages, at, monkeypatch):
 
 @pytest.mark.parametrize("harm", [flip, cut, remove], ids=lambda each: each.__name__)
 def test_damaged_snapshot_falls_back_to_previous_one(arm, caplog, harm):
-    arm.log_batches(0, 1)
-    arm.store_snapshot()
-    arm.log_batches(2, 3)
-    arm.store_snapshot()
+    for batches in ((0, 1), (2, 3)):
+        arm.log_batches(*batches)
+        arm.store_snapshot()
     with arm.database.session() as session:
         newest = snapshots.find_latest(session, ARM, 1, None)
     harm(arm.files.learning / f"{newest.id}.safetensors")
@@ -61,23 +73,14 @@ def test_damaged_snapshot_falls_back_to_previous_one(arm, caplog, harm):
     assert f"snapshot {newest.id} of version 1 of model 'arm' cannot be used" in caplog.text
 
 
-def test_restarts_from_snapshot_after_retention(arm):
+def test_deleted_events_are_restored_from_the_snapshot_alone(arm):
     arm.log_batches(*range(4))
     known = arm.restore_state(at_most=1)
     assert arm.store_snapshot() == 4
-    arm.log_batches(4)
-    with arm.database.transaction() as session:
-        session.connection().exec_driver_sql("DELETE FROM events WHERE number <= 4")
-    assert advance(arm.database, arm.files, known).number == 4
-    assert_predictions(arm.follow_log(known).online, expected_predictions(range(5)))
-
-
-def test_remaining_log_is_learnt_if_snapshots_are_lost(arm):
-    arm.log_batches(*range(4))
-    arm.store_snapshot()
     arm.log_batches(4, 5)
-    with arm.database.transaction() as session:
-        session.connection().exec_driver_sql("DELETE FROM events WHERE number <= 4")
+    delete_events(arm, 4)
+    assert advance(arm.database, arm.files, known).number == 4
+    assert_predictions(arm.follow_log(known).online, expected_predictions(range(6)))
     for path in arm.files.learning.glob("*.safetensors"):
         path.unlink()
     found = arm.restore_state()
@@ -88,14 +91,10 @@ def test_remaining_log_is_learnt_if_snapshots_are_lost(arm):
 def test_loading_learns_a_limited_part_of_the_log(arm, monkeypatch):
     assert LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base) is None
     arm.log_batches(*range(6))
-    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
-    assert (found.revision, found.behind) == (6, False)
-    assert_predictions(found.model, expected_predictions(range(6)))
+    assert_loaded(arm, 6, is_behind=False)
     monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
     monkeypatch.setattr(learnt, "MAX_PAGES", 2)
-    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
-    assert (found.revision, found.behind) == (2, True)
-    assert_predictions(found.model, expected_predictions(range(2)))
+    assert_loaded(arm, 2, is_behind=True)
 
 
 def test_retired_version_uses_its_last_snapshot(arm):
@@ -104,9 +103,7 @@ def test_retired_version_uses_its_last_snapshot(arm):
     assert LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base) is None
     arm.store_snapshot(at_most=2)
     arm.log_batches(3)
-    found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
-    assert (found.revision, found.behind) == (2, False)
-    assert_predictions(found.model, expected_predictions(range(2)))
+    assert_loaded(arm, 2, is_behind=False)
 
 
 def test_recent_errors_set_a_floor_on_uncertainty(arm):
@@ -138,13 +135,12 @@ def test_unlearnt_batch_leaves_no_trace(arm, pages, at):
         arm.store_snapshot(at_most=at)
     known = arm.restore_state()
     assert arm.unlearn(3) == 7
-    expected = expected_predictions([0, 1, 3, 4, 5])
-    assert predictions_differ(expected, expected_predictions(range(6)))
-    assert_predictions(arm.restore_state().online, expected)
-    assert_predictions(arm.follow_log(known).online, expected)
-    arm.log_batches(6)
-    assert_predictions(arm.restore_state().online, expected_predictions([0, 1, 3, 4, 5, 6]))
-    assert_predictions(arm.follow_log(known).online, expected_predictions([0, 1, 3, 4, 5, 6]))
+    left = [0, 1, 3, 4, 5]
+    assert predictions_differ(expected_predictions(left), expected_predictions(range(6)))
+    for numbers in (left, [*left, 6]):
+        arm.log_batches(*set(numbers) - set(left))
+        assert_predictions(arm.restore_state().online, expected_predictions(numbers))
+        assert_predictions(arm.follow_log(known).online, expected_predictions(numbers))
 
 
 def test_rollback_between_pages_is_applied(arm, monkeypatch):
@@ -164,24 +160,16 @@ def test_rollback_between_pages_is_applied(arm, monkeypatch):
     assert_predictions(found.online, expected_predictions(range(2)))
 
 
-def test_batch_stays_with_warning_if_log_is_too_short(arm, caplog):
+@pytest.mark.parametrize("rolls_back", [False, True])
+def test_batch_stays_with_warning_if_log_is_too_short_and_rollback_is_applied(arm, caplog, rolls_back):
     arm.log_batches(*range(4))
     known = arm.restore_state()
-    with arm.database.transaction() as session:
-        session.connection().exec_driver_sql("DELETE FROM events WHERE number = 1")
+    delete_events(arm, 1)
     arm.unlearn(2)
-    assert_predictions(arm.follow_log(known).online, expected_predictions(range(4)))
-    assert "could not unlearn batch 1 of stream 's' of model 'arm'" in caplog.text
-
-
-def test_rollback_is_applied_though_a_batch_stays(arm):
-    arm.log_batches(*range(4))
-    known = arm.restore_state()
-    with arm.database.transaction() as session:
-        session.connection().exec_driver_sql("DELETE FROM events WHERE number = 1")
-    arm.unlearn(2)  # the log is too short for this
-    arm.rollback(3)
-    assert_predictions(arm.follow_log(known).online, expected_predictions([2]))
+    if rolls_back:
+        arm.rollback(3)
+    assert_predictions(arm.follow_log(known).online, expected_predictions([2] if rolls_back else range(4)))
+    assert rolls_back or "could not unlearn batch 1 of stream 's' of model 'arm'" in caplog.text
 
 
 def test_snapshot_of_undone_state_is_not_stored(arm):

@@ -25,7 +25,6 @@ from tests.service.learning.batches import (
 )
 
 BATCH_BYTES = len(encode(make_rows()))
-LATE_S = 1e9
 
 
 def add_snapshot(database, number, version=1):
@@ -39,49 +38,42 @@ def add_learner(database, version, start, role):
         session.add(LearnerRow(model=MODEL, version=version, start=start, role=role))
 
 
-def run_retention(database, batches=10**6, age=1e12, at=0.0, model=MODEL):
+def run_retention(database, batches=10**6, age=1e12, at=0.0):
     settings = Settings(observation_retention_bytes=max(batches * BATCH_BYTES, 1), observation_retention_s=age)
-    return snapshots.retain(database, settings, model, at)
+    return snapshots.retain(database, settings, MODEL, at)
 
 
 def list_numbers(database, model=MODEL):
     return [event.number for event in list_events(database, model)]
 
 
-def test_oldest_events_are_deleted_down_to_the_size_limit(database):
-    append_batches(database, *(make_batch(k) for k in range(10)))
-    append_batches(database, *(make_batch(k) for k in range(10)), model=OTHER)
-    add_snapshot(database, 9)
-    assert run_retention(database, batches=10) == 0
-    assert run_retention(database, batches=6) == 4
-    assert list_numbers(database) == [5, 6, 7, 8, 9, 10]
+@pytest.mark.parametrize(
+    ("snapshot_numbers", "limits", "deleted"),
+    [
+        ([9], {"batches": 10}, 0),
+        ([9], {"batches": 6}, 4),
+        ([10], {"batches": 1}, 9),
+        ([9], {"age": 100.0, "at": 1103.0}, 3),  # received at 1000, 1001, ...
+        ([], {"batches": 0}, 0),
+        ([3, 6], {"batches": 0}, 6),
+    ],
+    ids=["size kept", "size exceeded", "one left", "age exceeded", "no snapshot", "newer than the snapshots"],
+)
+@pytest.mark.parametrize("chunk", [3, snapshots.CHUNK_EVENTS])
+def test_oldest_events_in_a_snapshot_are_deleted_beyond_the_limits(
+    database, monkeypatch, snapshot_numbers, limits, deleted, chunk
+):
+    """Deletion spans several transactions, or one."""
+    monkeypatch.setattr(snapshots, "CHUNK_EVENTS", chunk)
+    for model in (MODEL, OTHER):
+        append_batches(database, *(make_batch(k) for k in range(10)), model=model)
+    for number in snapshot_numbers:
+        add_snapshot(database, number)
+    for expected in (deleted, 0):
+        assert run_retention(database, **limits) == expected
+        assert list_numbers(database) == list(range(deleted + 1, 11))
     assert list_numbers(database, OTHER) == list(range(1, 11))
-    assert run_retention(database, batches=6) == 0
-
-
-def test_events_beyond_the_age_limit_are_deleted(database):
-    append_batches(database, *(make_batch(k) for k in range(10)))  # received at 1000, 1001, ...
-    add_snapshot(database, 9)
-    assert run_retention(database, age=100.0, at=1103.0) == 3
-    assert list_numbers(database) == [4, 5, 6, 7, 8, 9, 10]
-
-
-def test_deletion_spans_several_transactions(database, monkeypatch):
-    monkeypatch.setattr(snapshots, "CHUNK_EVENTS", 3)
-    append_batches(database, *(make_batch(k) for k in range(12)))
-    add_snapshot(database, 12)
-    assert run_retention(database, batches=1) == 11
-    assert list_numbers(database) == [12]
-    assert append_batches(database, make_batch(12)) == [13]  # numbering continues
-
-
-def test_events_not_in_a_snapshot_are_kept(database):
-    append_batches(database, *(make_batch(k) for k in range(10)))
-    assert run_retention(database, batches=0) == 0
-    add_snapshot(database, 3)
-    add_snapshot(database, 6)
-    assert run_retention(database, batches=0) == 6
-    assert list_numbers(database) == [7, 8, 9, 10]
+    assert append_batches(database, make_batch(10)) == [11]  # numbering continues
 
 
 def test_events_needed_by_the_learning_version_are_kept(database):
@@ -134,12 +126,16 @@ def test_deleted_batches_are_still_recognised(database):
     assert [is_forgotten(robot, k) for k in (3, 4, 5, 6, 7, 9)] == [False, True, True, True, False, False]
 
 
+def append_limited(database, stream_id, received, max_streams):
+    """Log the first batch of a stream of a model that keeps a limited number of streams."""
+    with database.transaction() as session:
+        log.append_batch(session, MODEL, make_batch(0, stream_id=stream_id, received=received), max_streams=max_streams)
+
+
 @pytest.mark.parametrize("runs", [60, slow(10_000)])
 def test_longest_silent_stream_is_replaced(database, runs):
-    def run(number, received, **fields):
-        with database.transaction() as session:
-            arrived = make_batch(0, stream_id=f"run-{number}", received=received, **fields)
-            log.append_batch(session, MODEL, arrived, max_streams=20)
+    def run(number, received):
+        append_limited(database, f"run-{number}", received, max_streams=20)
 
     for number in range(runs):
         run(number, 1000.0 + number)
@@ -155,9 +151,13 @@ def test_longest_silent_stream_is_replaced(database, runs):
 
 def test_silent_streams_without_payload_are_deleted(database):
     body = {"mass": 1.0, "com": [0.0, 0.0, 0.1], "inertia": None}
-    gone, put_down = PayloadRecord(1, 0.0, body=None), PayloadRecord(1, 0.0, {"held": None}, 1)
-    held = (PayloadRecord(1, 0.0, body=body), PayloadRecord(1, 0.0, {"held": {}}, 1))
-    payloads = {"nothing": None, "gone": gone, "put-down": put_down, "declared": held[0], "noticed": held[1]}
+    payloads = {
+        "nothing": None,
+        "gone": PayloadRecord(1, 0.0, body=None),
+        "put-down": PayloadRecord(1, 0.0, {"held": None}, 1),
+        "declared": PayloadRecord(1, 0.0, body=body),
+        "noticed": PayloadRecord(1, 0.0, {"held": {}}, 1),
+    }
     for received, name in enumerate([*payloads, "young"]):
         append_batches(database, make_batch(0, stream_id=name, received=1000.0 + received))
     with database.transaction() as session:
@@ -174,9 +174,8 @@ def test_silent_streams_without_payload_are_deleted(database):
 def test_active_streams_are_not_replaced(database):
     for number in range(3):
         append_batches(database, make_batch(0, stream_id=f"robot-{number}", received=1000.0 + number))
-    with database.transaction() as session, pytest.raises(BusyError, match="3 active streams"):
-        log.append_batch(session, MODEL, make_batch(0, stream_id="new", received=1009.0), max_streams=3)
-    with database.transaction() as session:
-        log.append_batch(session, MODEL, make_batch(0, stream_id="new", received=1011.0), max_streams=3)
+    with pytest.raises(BusyError, match="3 active streams"):
+        append_limited(database, "new", 1009.0, max_streams=3)
+    append_limited(database, "new", 1011.0, max_streams=3)
     assert find_stream(database, "robot-0") is None
     assert find_stream(database, "robot-1") is not None

@@ -30,22 +30,23 @@ def serve_version(arm, version):
         return registry.serve(session, ARM, version)
 
 
-def read_roles(arm):
-    with arm.database.session() as session:
-        rows = [session.get(LearnerRow, (ARM, version)) for version in range(1, 10)]
-    return {row.version: (row.start, row.role) for row in rows if row is not None}
+def read_roles(database, model=ARM):
+    """Return the first event and the role of each version."""
+    with database.session() as session:
+        rows = session.scalars(select(LearnerRow).where(LearnerRow.model == model))
+        return {row.version: (row.start, row.role) for row in rows}
 
 
 def test_candidate_does_not_serve_until_promoted(arm):
     arm.log_batches(0, 1, 2)
     assert arm.publish(candidate=True, start=1) == 2
     assert read_serving(arm) == Serving(1, 1)
-    assert read_roles(arm) == {1: (0, "serving"), 2: (1, "dismissed")}
+    assert read_roles(arm.database) == {1: (0, "serving"), 2: (1, "dismissed")}
     assert registry.find(arm.database, ARM, None).version == 1
     shown = registry.show(arm.database, ARM)
     assert (shown.latest_version, shown.serving_version) == (2, 1)
     assert serve_version(arm, 2) == 2
-    assert read_roles(arm) == {1: (0, "dismissed"), 2: (1, "serving")}
+    assert read_roles(arm.database) == {1: (0, "dismissed"), 2: (1, "serving")}
     assert registry.find(arm.database, ARM, None).version == 2
     assert registry.show(arm.database, ARM).serving_version == 2
 
@@ -85,18 +86,21 @@ def test_unreadable_version_leaves_previous_one_serving(arm, loaded_models, capl
 
 
 def test_predictions_follow_the_serving_version_both_ways(arm, loaded_models):
+    def read_versions():
+        return loaded_models.hot(ARM, None).version, loaded_models.newest(ARM)
+
     assert loaded_models.get(ARM, None).version == 1
     arm.publish(candidate=True)
     loaded_models.announce([ARM])
     loaded_models.adopt(ARM)
-    assert (loaded_models.hot(ARM, None).version, loaded_models.newest(ARM)) == (1, 1)
+    assert read_versions() == (1, 1)
     serve_version(arm, 2)
     assert loaded_models.hot(ARM, None).version == 1
     loaded_models.announce([ARM, "nobody"])
-    assert (loaded_models.hot(ARM, None).version, loaded_models.newest(ARM)) == (2, 2)
+    assert read_versions() == (2, 2)
     serve_version(arm, 1)
     loaded_models.adopt(ARM)
-    assert (loaded_models.hot(ARM, None).version, loaded_models.newest(ARM)) == (1, 1)
+    assert read_versions() == (1, 1)
 
 
 def test_late_notice_does_not_undo_a_later_decision(arm, loaded_models):
@@ -121,88 +125,64 @@ def decide_refresh(learning_service, learning_model, version=2, better=True, ser
     return outcome
 
 
-def list_roles(learning_service, learning_model):
-    """Return the role of each version."""
-    with learning_service.service.database.session() as session:
-        rows = session.scalars(select(LearnerRow).where(LearnerRow.model == learning_model.name))
-        return {row.version: row.role for row in rows}
-
-
 def read_serving_versions(learning_model):
     """Return the serving version as shown, and the version that predicts."""
     reply = read_json(learning_model.client.get(f"/v1/models/{learning_model.name}"))["serving_version"]
     return reply, learning_model.predict()["version"]
 
 
-def test_better_candidate_serves_and_learns(learning_service, learning_model):
+@pytest.mark.parametrize("better", [True, False], ids=["better", "no better"])
+def test_candidate_serves_and_learns_if_better(learning_service, learning_model, better):
     assert read_serving_versions(learning_model) == (1, 1)
     learning_service.publish(learning_model.name, candidate=True)
     assert read_serving_versions(learning_model) == (1, 1)
-    assert decide_refresh(learning_service, learning_model).startswith("is now serving: it predicts")
-    assert learning_service.service.loaded.hot(learning_model.name, None).version == 2
-    assert read_serving_versions(learning_model) == (2, 2)
-    assert list_roles(learning_service, learning_model) == {1: "dismissed", 2: "serving"}
+    outcome = decide_refresh(learning_service, learning_model, better=better)
+    assert outcome.startswith("is now serving: it predicts" if better else "is dismissed: it predicts")
+    serving, dismissed = (2, 1) if better else (1, 2)
+    assert learning_service.service.loaded.hot(learning_model.name, None).version == serving
+    assert read_serving_versions(learning_model) == (serving, serving)
+    roles = read_roles(learning_service.service.database, learning_model.name)
+    assert roles == {serving: (0, "serving"), dismissed: (0, "dismissed")}
     [alarm] = learning_model.get("alarms")["items"]
     assert alarm["kind"] == "promotion"
-    assert alarm["evidence"] == {"serving": 1, "candidate": 2, "verdict": "promote", "promoted": True, **EVIDENCE}
-    line = read_newest_audit_line(learning_model)
-    assert (line["change"], line["alias"], line["what"]) == ("alias moved", "serving", "service")
-    assert (line["before"], line["after"]) == (1, 2)
-
-
-def read_newest_audit_line(learning_model):
-    """Return the newest line of the audit log of a model."""
-    return read_json(learning_model.client.get("/v1/audit", params={"model": learning_model.name}))["items"][0]
-
-
-def test_candidate_that_is_not_better_is_dismissed(learning_service, learning_model):
-    learning_service.publish(learning_model.name, candidate=True)
-    assert decide_refresh(learning_service, learning_model, better=False).startswith("is dismissed: it predicts")
-    assert read_serving_versions(learning_model) == (1, 1)
-    assert list_roles(learning_service, learning_model) == {1: "serving", 2: "dismissed"}
-    [alarm] = learning_model.get("alarms")["items"]
-    assert (alarm["evidence"]["verdict"], alarm["evidence"]["promoted"]) == ("dismiss", False)
-    line = read_newest_audit_line(learning_model)
-    assert (line["change"], line["version"], line["what"]) == ("candidate dismissed", 2, "service")
-    assert line["after"] == {"verdict": "dismiss", "serving": 1}
+    verdict = {"verdict": "promote" if better else "dismiss", "promoted": better}
+    assert alarm["evidence"] == {"serving": 1, "candidate": 2, **verdict, **EVIDENCE}
+    line = read_json(learning_model.client.get("/v1/audit", params={"model": learning_model.name}))["items"][0]
+    if better:
+        expected = {"change": "alias moved", "alias": "serving", "before": 1, "after": 2}
+    else:
+        expected = {"change": "candidate dismissed", "version": 2, "after": {"verdict": "dismiss", "serving": 1}}
+    assert line.items() >= {"what": "service", **expected}.items()
 
 
 def test_old_automatic_versions_are_deleted_unless_needed(learning_service, learning_model, monkeypatch):
     monkeypatch.setattr("service.models.deletion.MAX_REFRESHED", 1)
 
+    name, client = learning_model.name, learning_model.client
+
     def end_refresh(version, trigger, better):
         """Publish and judge the version of a refresh job."""
-        learning_service.publish(learning_model.name, candidate=True)
-        job = f"job_{learning_model.name[-20:]}_{version}"
+        learning_service.publish(name, candidate=True)
+        job, request = f"job_{name[-20:]}_{version}", {"refresh": {"version": 1, "trigger": trigger}}
         with learning_service.service.database.transaction() as session:
-            request = {"refresh": {"version": 1, "trigger": trigger}}
-            session.add(
-                JobRow(
-                    id=job, model=learning_model.name, state="succeeded", request=request, progress={}, created_at=now()
-                )
-            )
-            session.get_one(VersionRow, (learning_model.name, version)).job = job
+            session.add(JobRow(id=job, model=name, state="succeeded", request=request, progress={}, created_at=now()))
+            session.get_one(VersionRow, (name, version)).job = job
         decide_refresh(learning_service, learning_model, version, better, read_serving_versions(learning_model)[0])
+
+    def list_versions():
+        return [each["version"] for each in read_json(client.get(f"/v1/models/{name}"))["versions"]]
 
     end_refresh(2, "novelty", True)
     end_refresh(3, "asked", True)  # 2 is kept as the target of a rollback
     end_refresh(4, "linearisation", False)
-    read_json(learning_model.client.put(f"/v1/models/{learning_model.name}/aliases/liked", json={"version": 4}))
+    learning_model.put("aliases/liked", {"version": 4})
     end_refresh(5, "novelty", False)
-    assert list_versions(learning_model) == [1, 2, 3, 4, 5]
+    assert list_versions() == [1, 2, 3, 4, 5]
     end_refresh(6, "novelty", False)
-    assert list_versions(learning_model) == [1, 2, 3, 4, 6]
-    lines = read_json(learning_model.client.get("/v1/audit", params={"model": learning_model.name}))["items"]
+    assert list_versions() == [1, 2, 3, 4, 6]
+    lines = read_json(client.get("/v1/audit", params={"model": name}))["items"]
     assert [line["version"] for line in lines if line["change"] == "version deleted"] == [5]
     assert read_serving_versions(learning_model) == (3, 3)
-
-
-def list_versions(learning_model):
-    """Return the existing versions."""
-    return [
-        each["version"]
-        for each in read_json(learning_model.client.get(f"/v1/models/{learning_model.name}"))["versions"]
-    ]
 
 
 def test_candidate_waits_without_auto_promote(learning_service, learning_model):

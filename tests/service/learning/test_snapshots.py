@@ -28,15 +28,14 @@ def files(home):
     return Files(home)
 
 
-def save_snapshot(database, files, number, version=1, most=20, model=MODEL, seen=None):
+def save_snapshot(database, files, number, version=1, most=20, model=MODEL):
     payload = f"{model} {version} {number}".encode()
-    seen = number if seen is None else seen
-    return snapshots.save(database, files, model, version, number, seen, payload, most=most)
+    return snapshots.save(database, files, model, version, number, number, payload, most=most)
 
 
-def find_latest(database, version=1, at_most=None, model=MODEL):
+def find_latest(database, version=1, at_most=None):
     with database.session() as session:
-        return snapshots.find_latest(session, model, version, at_most)
+        return snapshots.find_latest(session, MODEL, version, at_most)
 
 
 def list_numbers(database):
@@ -44,13 +43,12 @@ def list_numbers(database):
         return sorted(session.scalars(select(SnapshotRow.number)))
 
 
-def list_files(files):
-    return {path.name.removesuffix(".safetensors") for path in files.learning.iterdir()}
-
-
-def list_ids(database):
+def list_ids(database, files):
+    """Return the snapshots in the database, which are those in the files."""
     with database.session() as session:
-        return set(session.scalars(select(SnapshotRow.id)))
+        ids = set(session.scalars(select(SnapshotRow.id)))
+    assert {path.name.removesuffix(".safetensors") for path in files.learning.iterdir()} == ids
+    return ids
 
 
 def test_latest_snapshot_of_a_version_is_found(database, files):
@@ -68,14 +66,14 @@ def test_latest_snapshot_of_a_version_is_found(database, files):
 
 def test_files_match_rows(database, files):
     names = [save_snapshot(database, files, number) for number in (5, 6, 7, 7)]
-    assert list_files(files) == list_ids(database) == {*names[:2], names[3]}  # the second 7 replaces the first
+    assert list_ids(database, files) == {*names[:2], names[3]}  # the second 7 replaces the first
 
 
 def test_rolled_back_state_is_not_stored(database, files):
     roll_back(database, 20)  # event 41
     assert save_snapshot(database, files, 30) is None
     assert save_snapshot(database, files, 40) is None
-    assert (list_numbers(database), list_files(files)) == ([], set())
+    assert list_ids(database, files) == set()
     assert save_snapshot(database, files, 20)  # the rollback target
     assert save_snapshot(database, files, 41)
     assert list_numbers(database) == [20, 41]
@@ -90,7 +88,7 @@ def test_snapshots_per_version_are_limited(database, files):
     assert left[0] == 1
     assert left[-3:] == [28, 29, 30]
     assert find_latest(database, version=2).number == 3
-    assert list_files(files) == list_ids(database)
+    assert len(list_ids(database, files)) == 7
 
 
 @given(st.lists(st.integers(0, 1000), unique=True, max_size=40), st.integers(2, 12))
@@ -119,7 +117,7 @@ def test_files_of_interrupted_saves_are_deleted(database, files):
     (files.learning / "snap_half.draft").write_bytes(b"half")
     (files.learning / "snap_unnamed.safetensors").write_bytes(b"whole")
     assert snapshots.sweep(database, files) == 2
-    assert list_files(files) == {kept}
+    assert list_ids(database, files) == {kept}
     assert snapshots.sweep(database, files) == 0
 
 

@@ -32,6 +32,7 @@ from tests.service.server import Server
 
 KEY = ("panda", 1, "arm")
 PICKUP_S, RATE_HZ = 1.0, 100.0
+PICKUP_BATCH = 10
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +42,9 @@ def model():
 
 @pytest.fixture(scope="module")
 def batches():
-    """Batches of ten rows of a Panda that picks up 1.5 kg at PICKUP_S."""
-    seen = simulate(
-        load_robot("panda"), Simulation(300, RATE_HZ, speed=5.0, noise=0.05, payload=Payload(1.5, PICKUP_S)), 7
-    )
+    """Batches of ten rows of a Panda that picks up 1.5 kg at PICKUP_S, in batch PICKUP_BATCH."""
+    simulation = Simulation(300, RATE_HZ, speed=5.0, noise=0.05, payload=Payload(1.5, PICKUP_S))
+    seen = simulate(load_robot("panda"), simulation, 7)
     rows = Rows(seen.t, seen.q, seen.dq, seen.ddq, seen.tau, np.zeros(len(seen), np.uint8))
     return [rows.take(slice(at, at + 10)) for at in range(0, 300, 10)]
 
@@ -62,8 +62,8 @@ def weigher(model):
     return Weigher(Versions())
 
 
-def follow(weigher, rows, event=0, **more):
-    return list(weigher.follow(KEY, [StreamRows(rows, float(rows.time[-1]), event, **more)]))
+def follow(weigher, rows, event=0, key=KEY, **more):
+    return list(weigher.follow(key, [StreamRows(rows, float(rows.time[-1]), event, **more)]))
 
 
 def follow_batches(weigher, batches):
@@ -74,14 +74,11 @@ def follow_batches(weigher, batches):
     return out
 
 
-def refine_all(weigher, monkeypatch):
-    """Refine until nothing is left to refine; return the messages."""
-    monkeypatch.setattr(worker, "REFINING_S", 1e3)
-    weigher._left = 1e3
-    out = []
-    while weigher.pause() < np.inf:
-        out += weigher.refine()
-    return out
+@pytest.fixture
+def loaded_weigher(weigher, batches):
+    """Weigher whose stream has picked up the payload; it has refined nothing yet."""
+    follow_batches(weigher, batches[: PICKUP_BATCH + 1])
+    return weigher
 
 
 def test_unknown_stream_is_requested(weigher, batches):
@@ -91,14 +88,19 @@ def test_unknown_stream_is_requested(weigher, batches):
 
 
 def test_payload_is_reported_at_once_then_refined(weigher, batches, model, monkeypatch):
-    first = follow_batches(weigher, batches[:11])[-1]
+    first = follow_batches(weigher, batches[: PICKUP_BATCH + 1])[-1]
     assert isinstance(first, WatchUpdate)
-    assert (first.stream, first.received) == (KEY, batches[10].time[-1])
+    assert (first.stream, first.received) == (KEY, batches[PICKUP_BATCH].time[-1])
     assert first.watch.since == pytest.approx(PICKUP_S, abs=0.011)
     assert len(first.watch.held.rows) == 0
     assert first.watch.held.estimate.mass[0] == pytest.approx(1.5, abs=0.05)
     assert weigher.pause() < np.inf
-    better = refine_all(weigher, monkeypatch)[-1]
+    monkeypatch.setattr(worker, "REFINING_S", 1e3)
+    weigher._left = 1e3
+    refined = []
+    while weigher.pause() < np.inf:
+        refined += weigher.refine()
+    better = refined[-1]
     assert better.watch.held.refined == first.watch.held.count
     assert better.watch.held.estimate.draws == ()  # draws stay in the weigher
     later_rows = batches[20]
@@ -107,38 +109,34 @@ def test_payload_is_reported_at_once_then_refined(weigher, batches, model, monke
     assert inside.mean() > 0.9
 
 
-def test_refinement_leaves_most_of_the_time_to_rows(weigher, batches, monkeypatch):
-    follow_batches(weigher, batches[:11])
-    while weigher._preparing:
-        list(weigher.refine())
+def test_refinement_leaves_most_of_the_time_to_rows(loaded_weigher, monkeypatch):
+    while loaded_weigher._preparing:
+        list(loaded_weigher.refine())
     now = time.monotonic()  # a frozen clock credits no time during a step, however slow the machine
     monkeypatch.setattr(worker, "time", SimpleNamespace(monotonic=lambda: now, process_time=time.process_time))
-    assert weigher.pause() == 0.0
-    weigher._left = 1e-9
-    list(weigher.refine())
-    assert weigher.pause() > 0.0
-    before = weigher._streams[KEY].refining
-    assert list(weigher.refine()) == []  # not due
-    assert weigher._streams[KEY].refining is before
+    assert loaded_weigher.pause() == 0.0
+    loaded_weigher._left = 1e-9
+    list(loaded_weigher.refine())
+    assert loaded_weigher.pause() > 0.0
+    before = loaded_weigher._streams[KEY].refining
+    assert list(loaded_weigher.refine()) == []  # not due
+    assert loaded_weigher._streams[KEY].refining is before
 
 
-def test_declared_payload_applies_to_later_rows(weigher, batches, model):
-    follow_batches(weigher, batches[:11])
-    carrier = Carrier(model)
-    declared = PayloadTracker(7).declare(carrier, Body(1.5, np.array([0.0, 0.0, 0.0])), PICKUP_S).outline()
+def test_declared_payload_applies_to_later_rows(loaded_weigher, batches, model):
+    body = Body(1.5, np.array([0.0, 0.0, 0.0]))
+    declared = PayloadTracker(7).declare(Carrier(model), body, PICKUP_S).outline()
     late = [StreamRows(batches[11], 0.0, 0), StreamRows(batches[12], 1.0, 5, watch=declared)]
-    reply = list(weigher.follow(KEY, late))[-1]
+    reply = list(loaded_weigher.follow(KEY, late))[-1]
     assert (reply.event, reply.watch.held.count) == (5, 10)  # the rows since the declaration
     assert reply.watch.held.estimate.mass[0] == pytest.approx(1.5, abs=0.1)
 
 
-def test_posterior_updates_are_applied(weigher, batches, model):
-    follow_batches(weigher, batches[:11])
-    weights, root = model.posterior.weights * 1.001, model.posterior.root
-    follow(weigher, batches[11], posterior=PosteriorUpdate(weights, root))
-    assert weigher._streams[KEY].carrier.model.posterior.weights is weights
-    follow(weigher, batches[12])
-    assert weigher._streams[KEY].carrier.model.posterior.weights is weights
+def test_posterior_updates_are_applied(loaded_weigher, batches, model):
+    update = PosteriorUpdate(model.posterior.weights * 1.001, model.posterior.root)
+    for rows, posterior in ((batches[11], update), (batches[12], None)):
+        follow(loaded_weigher, rows, posterior=posterior)
+        assert loaded_weigher._streams[KEY].carrier.model.posterior.weights is update.weights
 
 
 def test_failing_stream_is_requested_again(weigher, batches, monkeypatch, caplog):
@@ -153,29 +151,14 @@ def test_failing_stream_is_requested_again(weigher, batches, monkeypatch, caplog
 def test_longest_silent_stream_is_dropped(weigher, batches, monkeypatch):
     monkeypatch.setattr(worker, "MAX_STREAMS", 1)
     follow_batches(weigher, batches[:2])
-    other = (*KEY[:2], "other")
-    list(weigher.follow(other, [StreamRows(batches[0], 0.0, 0, watch=PayloadTracker(7))]))
+    follow(weigher, batches[0], key=(*KEY[:2], "other"), watch=PayloadTracker(7))
     assert follow(weigher, batches[2]) == [UnknownStream(KEY)]
 
 
-def test_deleted_model_is_forgotten(weigher, batches):
-    follow_batches(weigher, batches[:11])
-    weigher.forget(KEY[0])
-    assert weigher.pause() == np.inf
-    assert follow(weigher, batches[11]) == [UnknownStream(KEY)]
-
-
-@pytest.mark.slow
-def test_recreated_model_starts_without_payloads(panda):
-    client = panda.client
-    publish_arm_at(panda.home, "arm")
-    send_payload_batches(client, "arm", "cell")
-    assert client.delete("/v1/models/arm").status_code == 204
-    publish_arm_at(panda.home, "arm")
-    assert client.get("/v1/models/arm/payload").json()["streams"] == []
-    send_payload_batches(client, "arm", "cell")
-    (shown,) = client.get("/v1/models/arm/payload").json()["streams"]
-    assert shown["payload"]["mass"]["mean"] == pytest.approx(1.5, abs=0.05)
+def test_deleted_model_is_forgotten(loaded_weigher, batches):
+    loaded_weigher.forget(KEY[0])
+    assert loaded_weigher.pause() == np.inf
+    assert follow(loaded_weigher, batches[11]) == [UnknownStream(KEY)]
 
 
 @pytest.fixture
@@ -184,9 +167,24 @@ def panda(tmp_path):
         yield server
 
 
+def list_streams(client, model="panda-sim"):
+    return client.get(f"/v1/models/{model}/payload").json()["streams"]
+
+
 def read_masses(client):
-    streams = client.get("/v1/models/panda-sim/payload").json()["streams"]
-    return {each["stream_id"]: each["payload"] and each["payload"]["mass"]["mean"] for each in streams}
+    return {each["stream_id"]: each["payload"] and each["payload"]["mass"]["mean"] for each in list_streams(client)}
+
+
+@pytest.mark.slow
+def test_recreated_model_starts_without_payloads(panda):
+    publish_arm_at(panda.home, "arm")
+    send_payload_batches(panda.client, "arm", "cell")
+    assert panda.client.delete("/v1/models/arm").status_code == 204
+    publish_arm_at(panda.home, "arm")
+    assert list_streams(panda.client, "arm") == []
+    send_payload_batches(panda.client, "arm", "cell")
+    (shown,) = list_streams(panda.client, "arm")
+    assert shown["payload"]["mass"]["mean"] == pytest.approx(1.5, abs=0.05)
 
 
 @pytest.mark.slow
@@ -199,8 +197,7 @@ def test_killed_weigher_restarts_with_known_payloads(panda):
         os.kill(pid, signal.SIGKILL)
     eventually(lambda: len(panda.started()) == len(killed) and not {*panda.started()} & {*killed})
     send_payload_batches(client, "panda-sim", "two")
-    assert read_masses(client)["two"] == pytest.approx(1.5, abs=0.05)
-    assert read_masses(client)["one"] == pytest.approx(1.5, abs=0.05)
+    assert read_masses(client) == pytest.approx({"one": 1.5, "two": 1.5}, abs=0.05)
 
 
 @pytest.mark.slow
@@ -208,8 +205,8 @@ def test_batches_with_undetected_payload_are_unlearnt(panda):
     client, route = panda.client, "/v1/models/panda-sim/observations"
     client.put("/v1/models/panda-sim/learning", json={"contact_threshold": 100.0})  # all rows are learnt
     send_payload_batches(client, "panda-sim", "arm", mass=0.3)
-    since = eventually(lambda: read_masses(client)["arm"]) and client.get("/v1/models/panda-sim/payload").json()
-    assert since["streams"][0]["state"] == "payload"
+    eventually(lambda: read_masses(client)["arm"])
+    assert list_streams(client)[0]["state"] == "payload"
     eventually(lambda: client.get(f"{route}/arm/2").json()["state"] == "unlearnt")
     assert client.get(f"{route}/arm/0").json()["state"] == "learnt"
 
@@ -219,7 +216,7 @@ def test_new_version_keeps_payload_with_wider_uncertainty(panda):
     client = panda.client
     publish_arm_at(panda.home, "arm")
     send_payload_batches(client, "arm", "cell")
-    (before,) = client.get("/v1/models/arm/payload").json()["streams"]
+    (before,) = list_streams(client, "arm")
     publish_arm_at(panda.home, "arm")
     client.put("/v1/models/arm/aliases/serving", json={"version": 2})
     shown = eventually(lambda: (each := client.get("/v1/models/arm/payload").json())["version"] == 2 and each)
@@ -237,21 +234,23 @@ def test_new_version_keeps_payload_with_wider_uncertainty(panda):
 def test_payloads_survive_rollback_retention_and_restart(tmp_path, others):
     name, home = "panda-sim", tmp_path / "home"
     with Server(home, warm=True) as server:
-        client = server.client
-        send_payload_batches(client, name, "arm")
+
+        def request(method, path, body=None):
+            answer = server.client.request(method, f"/v1/models/{name}/{path}", json=body)
+            assert answer.status_code == 200, answer.text
+            return answer.json()
+
+        send_payload_batches(server.client, name, "arm")
         for body in payload_batches("declared", mass=0.0):
-            assert client.post(f"/v1/models/{name}/observations", json=body).status_code == 200
-        body = {"mass": 2.0, "com": [0.0, 0.0, 0.1], "stream_id": "declared"}
-        assert client.put(f"/v1/models/{name}/payload", json=body).status_code == 200
-        eventually(lambda: client.get(f"/v1/models/{name}/alarms").json()["items"])  # the payload event is logged
-        assert client.post(f"/v1/models/{name}/rollback", json={"revision": 0}).status_code == 200
+            request("POST", "observations", body)
+        request("PUT", "payload", {"mass": 2.0, "com": [0.0, 0.0, 0.1], "stream_id": "declared"})
+        eventually(lambda: request("GET", "alarms")["items"])  # the payload event is logged
+        request("POST", "rollback", {"revision": 0})
         first = payload_batches("other", mass=0.0)[0]
         for number in range(others):
             times = (np.array(first["t"]) + 0.25 * number).tolist()
-            body = first | {"sequence": number, "t": times}
-            assert client.post(f"/v1/models/{name}/observations", json=body).status_code == 200
-        learning = f"/v1/models/{name}/learning"
-        eventually(lambda: client.get(learning).json()["status"]["lag_events"] == 0)
+            request("POST", "observations", first | {"sequence": number, "t": times})
+        eventually(lambda: request("GET", "learning")["status"]["lag_events"] == 0)
         server.terminate()
     settings = Settings(home=home, observation_retention_s=1.0)
     with closing(Database.of(settings)) as database:
