@@ -40,13 +40,6 @@ def references(node):
             yield from references(value)
 
 
-def resolve(document, reference):
-    assert reference.startswith("#/"), reference
-    for part in reference[2:].split("/"):
-        document = document[part]
-    return document
-
-
 def test_every_schema_is_used(document):
     used = {reference.rpartition("/")[2] for reference in references(document)}
     assert set(document["components"]["schemas"]) == used
@@ -68,9 +61,7 @@ def test_document_has_the_required_structure(document, operations):
 
 def test_every_route_has_a_description(operations):
     for name, operation in operations.items():
-        assert operation["tags"], name
-        assert operation["summary"], name
-        assert operation["description"], name
+        assert all(operation[field] for field in ("tags", "summary", "description")), name
         assert operation["description"] != operation["summary"], name
         for item in operation.get("parameters", []):
             assert "schema" in item, (name, item["name"])
@@ -101,12 +92,14 @@ def test_common_errors_are_documented_at_every_route(operations):
 
 
 def test_requests_have_examples(document, operations):
-    bodies = {name: operation["requestBody"] for name, operation in operations.items() if "requestBody" in operation}
-    for name, body in bodies.items():
+    for name, operation in operations.items():
+        if (body := operation.get("requestBody")) is None:
+            continue
         assert body["required"] is True
         media = next(iter(body["content"].values()))
         schema = media["schema"]
-        schema = resolve(document, schema["$ref"]) if "$ref" in schema else schema
+        if "$ref" in schema:
+            schema = document["components"]["schemas"][schema["$ref"].removeprefix("#/components/schemas/")]
         binary = schema.get("format") == "binary"  # an archive is binary and has no example
         assert media.get("example") or schema.get("examples") or binary, name
 
@@ -120,11 +113,10 @@ def test_example_of_a_query_is_answered(api, document):
 def test_example_of_an_inference_is_answered_as_documented(api, operations, operation):
     documented = operations[operation]
     answered = documented["responses"]["200"]["content"]
-    assert (
-        set(documented["requestBody"]["content"]) == set(answered) == {"application/json", "application/octet-stream"}
-    )
+    asked = documented["requestBody"]["content"]
+    assert set(asked) == set(answered) == {"application/json", "application/octet-stream"}
     path = operation.removeprefix("POST ").format(model="panda-sim", version=1)
-    answer = api.post(path, json=documented["requestBody"]["content"]["application/json"]["example"])
+    answer = api.post(path, json=asked["application/json"]["example"])
     assert answer.status_code == 200, answer.text
     result, expected = answer.json(), answered["application/json"]["example"]
     numbers, view = ([each.pop("data") for each in body["outputs"]] for body in (result, expected))
@@ -132,23 +124,27 @@ def test_example_of_an_inference_is_answered_as_documented(api, operations, oper
     assert np.allclose(numbers, view, atol=0.1)
 
 
-@pytest.mark.parametrize("path", ["/docs", "/docs/oauth2-redirect", "/static-offline-docs/swagger-ui-bundle.js"])
-def test_documentation_runs_only_its_scripts_and_is_not_framed(api, path):
+DASHBOARD = ("/", "/dashboard/app.js", "/dashboard/plotly/cartesian.js")
+DOCUMENTATION = ("/docs", "/docs/oauth2-redirect", "/static-offline-docs/swagger-ui-bundle.js")
+
+
+@pytest.mark.parametrize("path", [*DASHBOARD, *DOCUMENTATION])
+def test_pages_run_only_their_scripts_and_are_not_framed(api, path):
     answer = api.get(path)
     policy = dict(each.strip().split(" ", 1) for each in answer.headers["content-security-policy"].split(";"))
     assert policy["default-src"] == "'self'"
-    assert policy["frame-ancestors"] == policy["base-uri"] == "'none'"
+    assert policy["frame-ancestors"] == "'none'"
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    if path in DASHBOARD:
+        assert "script-src" not in policy
+        return
+    assert policy["base-uri"] == "'none'"
     scripts = re.findall(r"<script>(.*?)</script>", answer.text, re.DOTALL) if path.startswith("/docs") else []
     hashes = [f"'sha256-{b64encode(hashlib.sha256(each.encode()).digest()).decode()}'" for each in scripts]
     assert policy["script-src"].split() == ["'self'", *hashes]
-    assert answer.headers["x-content-type-options"] == "nosniff"
 
 
 def test_documentation_loads_nothing_from_other_hosts(api):
     page = api.get("/docs").text
     assert "https://" not in page
     assert "http://" not in page
-    assets = re.findall(r'(?:src|href)="([^"]+)"', page)
-    assert len(assets) >= 2
-    for asset in assets:
-        assert api.get(asset).status_code == 200

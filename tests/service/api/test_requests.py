@@ -4,6 +4,8 @@ import asyncio
 import logging
 import re
 import threading
+from contextlib import closing
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 from fastapi.testclient import TestClient
@@ -30,17 +32,10 @@ QUERY = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
 
 def run_context(app, scope):
     """Return the messages that an application sends through the middleware."""
-    sent = []
-
-    async def receive():
-        return {"type": "websocket.connect"}
-
-    async def send(message):
-        sent.append(message)
-
+    send = AsyncMock()
     context = RequestContext(app, Meters(), RequestLog((), slow_s=1.0, max_refusals=1))
-    asyncio.run(context({"headers": [], "path": "/x", "app": None, **scope}, receive, send))
-    return sent
+    asyncio.run(context({"headers": [], "path": "/x", "app": None, **scope}, AsyncMock(), send))
+    return [call.args[0] for call in send.await_args_list]
 
 
 @pytest.mark.parametrize(
@@ -84,14 +79,11 @@ def test_unexpected_error_is_logged_with_its_id_and_raised(api, monkeypatch):
         def emit(self, record):
             seen.append((record.getMessage(), request_id.get()))
 
-    def broken(*_):
-        raise RuntimeError("secret")
-
     def send_request(client):
         query = {**QUERY, "components": ["gravity"]}
         return client.post("/v1/models/panda-sim/predict", json=query, headers={"x-request-id": "mine"})
 
-    monkeypatch.setattr(inference, "predict", broken)
+    monkeypatch.setattr(inference, "predict", Mock(side_effect=RuntimeError("secret")))
     monkeypatch.setattr(logging.getLogger("service.api.errors"), "handlers", [Ids()])
     answer = send_request(TestClient(api.app, ADDRESS, raise_server_exceptions=False))
     assert answer.headers["x-request-id"] == "mine"
@@ -128,19 +120,22 @@ def test_accepted_stream_has_an_id():
     assert frame == {"type": "websocket.send", "bytes": b"untouched"}
 
 
-def test_ingest_threads_know_the_request_id():
+@pytest.fixture
+def threads():
+    """Threads for observation batches."""
+    with closing(IngestThreads()) as made:
+        yield made
+
+
+def test_ingest_threads_know_the_request_id(threads):
     async def send_request():
         request_id.set("batch-7")
         return await threads.run("arm", request_id.get)
 
-    threads = IngestThreads()
-    try:
-        assert asyncio.run(send_request()) == "batch-7"
-    finally:
-        threads.close()
+    assert asyncio.run(send_request()) == "batch-7"
 
 
-def test_batches_of_a_model_run_in_turn_without_blocking_others():
+def test_batches_of_a_model_run_in_turn_without_blocking_others(threads):
     gate, order = threading.Event(), []
 
     async def send_request():
@@ -151,15 +146,12 @@ def test_batches_of_a_model_run_in_turn_without_blocking_others():
         gate.set()
         await asyncio.gather(*slow)
 
-    threads = IngestThreads()
-    try:
-        asyncio.run(send_request())
-    finally:
-        threads.close()
+    asyncio.run(send_request())
     assert order == ["other", *range(5)]
 
 
 HOT = "/v1/models/{model}/predict"
+PREDICT = "/v1/models/panda-sim/predict"
 
 
 @pytest.fixture
@@ -184,16 +176,9 @@ def test_request_has_a_line(api, lines, monkeypatch):
     assert answer.status_code in (404, 422)
     (line,) = lines()
     assert line.pop("duration_ms") > 0
-    assert line == {
-        "event": "request",
-        "level": "INFO",
-        "method": "GET",
-        "route": "/v1/jobs/{job}",
-        "path": "/v1/jobs/nobody",
-        "client": "testclient",
-        "status": answer.status_code,
-        "code": answer.json()["error"]["code"],
-    }
+    asked = {"method": "GET", "route": "/v1/jobs/{job}", "path": "/v1/jobs/nobody", "client": "testclient"}
+    answered = {"status": answer.status_code, "code": answer.json()["error"]["code"]}
+    assert line == {"event": "request", "level": "INFO", **asked, **answered}
 
 
 HEALTH = ["/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"]
@@ -201,11 +186,10 @@ HEALTH = ["/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"
 
 def test_successful_control_and_monitoring_requests_have_no_line(api, lines, monkeypatch):
     monkeypatch.setattr(RequestLog, "_count_skipped", lambda *_: 0)  # as above
-    for path in ("/v1/models/panda-sim/predict", "/v1/echo"):
-        assert api.post(path, json=QUERY).status_code == 200
-    assert [api.get(path).status_code for path in HEALTH] == [200] * len(HEALTH)
+    answers = [api.post(path, json=QUERY) for path in (PREDICT, "/v1/echo")] + [api.get(path) for path in HEALTH]
+    assert [each.status_code for each in answers] == [200] * len(answers)
     assert not [line for line in lines() if "slow" not in line]
-    assert api.post("/v1/models/panda-sim/predict", json={"q": [1]}).status_code == 422
+    assert api.post(PREDICT, json={"q": [1]}).status_code == 422
     (line,) = (line for line in lines() if "slow" not in line)
     assert (line["route"], line["status"], line["code"]) == (HOT, 422, "invalid_request")
 
@@ -214,8 +198,8 @@ def test_slow_control_request_has_a_line(caplog, lines):
     log = RequestLog([HOT], slow_s=0.25, max_refusals=10)
     assert not log.may_log(HOT, 0.249)
     assert log.may_log(HOT, 0.25)
-    log_answer(log, seconds=0.249)
-    log_answer(log, seconds=0.25)
+    for seconds in (0.249, 0.25):
+        log_answer(log, seconds=seconds)
     assert [(line["duration_ms"], line["slow"]) for line in lines()] == [(250.0, True)]
     caplog.clear()
     caplog.set_level(logging.DEBUG, "service.requests")
@@ -239,8 +223,8 @@ def test_equal_rejections_are_counted(lines, monkeypatch):
     log_answer(log, 404, code="not_found")  # a rejection of another kind
     assert [line["status"] for line in lines()] == [401, 401, 401, 404]
     now[0] += 1.0
-    log_answer(log, 401, code="unauthorized")
-    log_answer(log, 401, code="unauthorized")
+    for _ in range(2):
+        log_answer(log, 401, code="unauthorized")
     assert [line.get("not_logged") for line in lines()] == [None, None, None, None, 47, None]
 
 

@@ -2,17 +2,20 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 from unittest.mock import patch
 
 import pytest
 from fastapi.testclient import TestClient
+from httpx import Client
 
 from service.api.access import keys
 from service.api.access.scopes import SCOPES
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from tests.service.cli.conftest import lipserve  # noqa: F401 - a fixture
+from tests.service.cli.conftest import lipserve, run_command  # noqa: F401 - fixtures
+from tests.service.data import eventually
 
 REFRESH_S = 0.05
 
@@ -21,14 +24,19 @@ REFRESH_S = 0.05
 class KeyedService:
     """A service that requires keys, one key of each scope, and a connection to its database like the CLI's."""
 
-    api: TestClient
+    api: Client
     secrets: dict[str, str]
     database: Database
 
     def make(self, *scopes: str) -> tuple[str, str]:
-        """Make a key; return its id and the key."""
+        """Make a key, wait until the service knows it, and return its id and the key."""
         row, secret = keys.create(self.database, "test", scopes, None)
+        eventually(lambda: self.get(secret).status_code != 401)
         return row.id, secret
+
+    def get(self, secret: str, path: str = "/v1/models") -> Any:
+        """Read an address with a key."""
+        return self.api.get(path, headers=bearer(secret))
 
 
 def bearer(secret: str) -> dict[str, str]:

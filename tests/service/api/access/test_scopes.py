@@ -25,6 +25,11 @@ def address(path: str) -> str:
     return re.sub(r"\{\w+\}", "0", path)
 
 
+def request(service, method, path, scope):
+    """Send a request with the key of a scope."""
+    return service.api.request(method, path, headers=bearer(service.secrets[scope]))
+
+
 def test_route_without_a_scope_prevents_the_start():
     app = FastAPI(docs_url=None, redoc_url=None)
     app.get("/v1/forgotten")(lambda: None)
@@ -52,7 +57,7 @@ def test_key_is_allowed_exactly_its_scope(keyed_service, scope):
     assert len(HTTP) > 40
     for method, path in HTTP:
         needed = RULES.table[method, path].scope
-        answer = keyed_service.api.request(method, address(path), headers=bearer(keyed_service.secrets[scope]))
+        answer = request(keyed_service, method, address(path), scope)
         if scope in (needed, ADMIN):
             assert answer.status_code not in (401, 403), (method, path, answer.text)
         else:
@@ -96,12 +101,9 @@ def test_no_address_bypasses_the_keys(keyed_service, method, path):
 def test_unlisted_routes_are_for_admins_only(keyed_service):
     for method, path in (("PATCH", "/v1/models"), ("GET", "/v1/nothing"), ("POST", "/health/live")):
         for scope in set(SCOPES) - {ADMIN}:
-            refusal = error(
-                keyed_service.api.request(method, path, headers=bearer(keyed_service.secrets[scope])), 404, "not_found"
-            )
+            refusal = error(request(keyed_service, method, path, scope), 404, "not_found")
             assert f"no route {method} {path}" in refusal["message"]
-        answer = keyed_service.api.request(method, path, headers=bearer(keyed_service.secrets[ADMIN]))
-        assert answer.status_code in (404, 405)
+        assert request(keyed_service, method, path, ADMIN).status_code in (404, 405)
 
 
 def test_head_needs_the_scope_of_get():

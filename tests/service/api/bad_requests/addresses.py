@@ -20,13 +20,9 @@ from tests.service.api.bad_requests.bad import (
 MODELS, EXPORT, URDF = "/v1/models", "/v1/models/panda-sim/export", "/v1/models/panda-sim/urdf"
 NO_ROUTES = (
     *("/dashboard", "/dashboard/%2e%2e/routes.py", "/v1", "//v1/models", "/v1/models/", "/V1/models", "/v1/models;x=1"),
-    *(
-        "/v1/models%00",
-        "/v1/models/%2e%2e/%2e%2e/etc/passwd",
-        "/v1/datasets/..%2f..%2fetc%2fpasswd",
-        "/v1/\u202emodels",
-    ),
-    *("/static-offline-docs/%2e%2e/core.py", "/static-offline-docs/%00", "/.git/config", "/" + "a" * 5000),
+    *("/v1/models%00", "/v1/models/%2e%2e/%2e%2e/etc/passwd", "/v1/datasets/..%2f..%2fetc%2fpasswd"),
+    *("/v1/\u202emodels", "/static-offline-docs/%2e%2e/core.py", "/static-offline-docs/%00", "/.git/config"),
+    "/" + "a" * 5000,
 )
 NOBODY = ("nobody", "PANDA-SIM", "panda-sim%00", "%2e%2e", "%ff", "p\u0430nda-sim", "a" * 3000)
 WRONG_METHODS = (
@@ -35,21 +31,19 @@ WRONG_METHODS = (
     *(("POST", LEARNING), ("PUT", OBSERVE), ("GET", "/v1/echo"), ("DELETE", "/openapi.json")),
 )
 PAGES = (DATASETS, ROBOTS, JOBS, MODELS, OBSERVE, f"{MODELS}/panda-sim/alarms")
+PARTS = ("aliases", "export", "urdf", "alarms", "quality", "live")
 MISSING = (
     *(("GET", f"{DATASETS}/ds_0", "dataset"), ("DELETE", f"{DATASETS}/ds_0", "dataset")),
     *(("GET", f"{DATASETS}/ds_0/preview", "dataset"), ("GET", f"{ROBOTS}/urdf_0", "robot")),
     *(("GET", f"{ROBOTS}/profiles/%2e%2e", "robot"), ("GET", f"{JOBS}/%E2%80%AE", "job")),
     *(("GET", f"{JOBS}/job_0/events", "job"), ("POST", f"{JOBS}/job_0/cancel", "job")),
     *(("POST", f"{JOBS}/job_0/retry", "job"), ("DELETE", f"{MODELS}/nobody", "model")),
-    *(
-        ("GET", f"{MODELS}/nobody/{part}", "model")
-        for part in ("aliases", "export", "urdf", "alarms", "quality", "live")
-    ),
+    *(("GET", f"{MODELS}/nobody/{part}", "model") for part in PARTS),
     *(("GET", f"{MODELS}/nobody/versions/1", "model"), ("GET", f"{MODELS}/panda-sim/versions/99", "version")),
     *(("DELETE", f"{MODELS}/panda-sim/versions/99", "version"), ("DELETE", f"{ALIASES}/no", "alias")),
     *(("POST", f"{ALIASES}/no/rollback", "alias"), ("GET", f"{EXPORT}?version=99", "version")),
     *(("GET", f"{EXPORT}?alias=nobody", "alias"), ("GET", f"{URDF}?version=99", "version")),
-    *(("GET", f"{URDF}?alias=nobody", "alias"),),
+    ("GET", f"{URDF}?alias=nobody", "alias"),
 )
 """Paths of things that do not exist, and the field that the error names."""
 

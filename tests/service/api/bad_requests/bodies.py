@@ -53,9 +53,9 @@ def with_missing_name(
     return with_value(path, base, name, *values, named=named, status=404, code="not_found")
 
 
-def first_wrong(value: Any) -> list[Any]:
-    """Return seven values, of which the first is no number."""
-    return [value, *ZERO[1:]]
+def first_wrong(*values: Any) -> list[list[Any]]:
+    """Return lists of seven values, of which the first is no number."""
+    return [[value, *ZERO[1:]] for value in values]
 
 
 def with_option(name: str, *values: Any) -> list[BadRequest]:
@@ -63,12 +63,15 @@ def with_option(name: str, *values: Any) -> list[BadRequest]:
     return [body(JOBS, JOB | {"options": {name: value}}, f"options.{name}") for value in values]
 
 
+def with_learning(name: str, *values: Any, named: str | None = None) -> list[BadRequest]:
+    """Return learning options with one wrong value each."""
+    return with_value(LEARNING, {}, name, *values, named=named, method="PUT")
+
+
 def with_payload(name: str, *values: Any, named: str | None = None) -> list[BadRequest]:
     """Return queries whose payload has one wrong value each."""
-    right = {"mass": 1.0, "com": [0.0, 0.0, 0.1]}
-    return with_value(
-        PREDICT, QUERY, "payload", *(right | {name: value} for value in values), named=named or f"payload.{name}"
-    )
+    wrong = ({"mass": 1.0, "com": [0.0, 0.0, 0.1], name: value} for value in values)
+    return with_value(PREDICT, QUERY, "payload", *wrong, named=named or f"payload.{name}")
 
 
 DIAGONAL = [[1, 0, 0], [0, 1, 0]]
@@ -81,10 +84,10 @@ NO_OBJECTS = [
 PREDICTING = [
     *with_value(PREDICT, QUERY, "q", None, "0", {}, 0, [], [[]], [0.0] * 6, [0.0] * 8),
     *with_value(
-        PREDICT, QUERY, "q", *map(first_wrong, ("0", True, None, {}, HALF, NAN, INF, -INF, 10**400, 90.0)), named="q[0]"
+        PREDICT, QUERY, "q", *first_wrong("0", True, None, {}, HALF, NAN, INF, -INF, 10**400, 90.0), named="q[0]"
     ),
-    *with_value(PREDICT, QUERY, "q", [ZERO, ZERO[1:]], [ZERO, 0.0], first_wrong([0.0]), named="q[1]"),
-    *with_value(PREDICT, QUERY, "q", [first_wrong(NAN)], [[ZERO]], named="q[0][0]"),
+    *with_value(PREDICT, QUERY, "q", [ZERO, ZERO[1:]], [ZERO, 0.0], *first_wrong([0.0]), named="q[1]"),
+    *with_value(PREDICT, QUERY, "q", first_wrong(NAN), [[ZERO]], named="q[0][0]"),
     *with_value(PREDICT, QUERY, "dq", [ZERO], ZERO[1:]),
     *with_value(PREDICT, QUERY, "ddq", [ZERO, ZERO]),
     *(body(PREDICT, {key: value for key, value in QUERY.items() if key != name}, name) for name in QUERY),
@@ -139,7 +142,7 @@ TEACHING = [
     *with_value(OBSERVE, BATCH, "stream_id", *ODD, None, 5),
     *with_value(OBSERVE, BATCH, "sequence", -1, 2**53, 1.5, "1", True, NAN),
     *with_value(OBSERVE, BATCH, "q", [], "0", None, [0.0] * 6),
-    *with_value(OBSERVE, BATCH, "q", first_wrong("0"), first_wrong(True), first_wrong(10**400), named="q[0]"),
+    *with_value(OBSERVE, BATCH, "q", *first_wrong("0", True, 10**400), named="q[0]"),
     *with_value(OBSERVE, BATCH, "tau", [ZERO, ZERO], []),
     *with_value(OBSERVE, BATCH, "t", [0.0, 1.0], []),
     *with_value(OBSERVE, BATCH, "t", "now", named="t[0]"),
@@ -152,25 +155,14 @@ TEACHING = [
     *with_value(OBSERVE + "/bad/0/replay", {}, "codes", [], "contact", ["learnt"], [None]),
 ]
 SETTING = [
-    *with_value(LEARNING, {}, "enabled", "on", None, 1, method="PUT"),
-    *with_value(LEARNING, {}, "forgetting_s", 0, -1, 1e308, NAN, INF, "1 h", method="PUT"),
-    *with_value(LEARNING, {}, "friction_walk_s", 0, 9.9, 1e308, NAN, INF, "1 h", method="PUT"),
-    *with_value(LEARNING, {}, "on_change", "wait", None, method="PUT"),
-    *with_value(LEARNING, {}, "torque_limits", [1.0] * 6, "87", method="PUT"),
-    *with_value(
-        LEARNING,
-        {},
-        "torque_limits",
-        first_wrong(-1),
-        first_wrong(5e-324),
-        first_wrong(1e7),
-        first_wrong(NAN),
-        first_wrong(INF),
-        named="torque_limits[0]",
-        method="PUT",
-    ),
-    *with_value(LEARNING, {}, "contact_threshold", 0, 5e-324, 2.9, 100.1, 1e308, NAN, None, method="PUT"),
-    *with_value(LEARNING, {}, "rate", 1, method="PUT"),
+    *with_learning("enabled", "on", None, 1),
+    *with_learning("forgetting_s", 0, -1, 1e308, NAN, INF, "1 h"),
+    *with_learning("friction_walk_s", 0, 9.9, 1e308, NAN, INF, "1 h"),
+    *with_learning("on_change", "wait", None),
+    *with_learning("torque_limits", [1.0] * 6, "87"),
+    *with_learning("torque_limits", *first_wrong(-1, 5e-324, 1e7, NAN, INF), named="torque_limits[0]"),
+    *with_learning("contact_threshold", 0, 5e-324, 2.9, 100.1, 1e308, NAN, None),
+    *with_learning("rate", 1),
     *with_value(ROLLBACK, {}, "revision", "0", False, -1, 2**53, 1.5, NAN),
     *with_value(ROLLBACK, {}, "version", 0, "x"),
     *with_missing_name(ROLLBACK, {}, "version", 99),

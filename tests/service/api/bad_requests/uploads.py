@@ -4,6 +4,10 @@ from tests.service.api.bad_requests.bad import DATASETS, ROBOTS, BadRequest
 
 CSV, NPZ, XML, FORM = "text/csv", "application/x-npz", "application/xml", "multipart/form-data; boundary=x"
 IMPORT, TAR = "/v1/models/import", "application/x-tar"
+TEXTS = ((DATASETS, CSV), (ROBOTS, XML))
+PATHS = (DATASETS, ROBOTS, IMPORT)
+UNSUPPORTED = ("", "text/plain", "application/octet-stream", "text/csvx", "*/*", "a" * 500)
+UNSUPPORTED_FILES = (b"data.xlsx", b"data", b".csv.exe")
 TYPE = ("unsupported_media_type", 415)
 UNNAMED = ("", "%20", "%0A", "a%00", "%1B[31ma", "a%E2%80%AEvsc", "a%E2%80%8Bb", "%EF%BB%BFa", "a%C2%85", "a" * 201)
 """Names that are not accepted."""
@@ -34,9 +38,18 @@ CHOICES: dict[str, dict[str, str]] = {
 
 
 def upload(
-    path: str, content: bytes, named: str | None, kind: str = CSV, code: str = "invalid_data", status: int = 422
+    path: str,
+    content: bytes,
+    named: str | None,
+    kind: str = CSV,
+    code: str = "invalid_data",
+    status: int = 422,
+    encoding: str = "",
 ) -> BadRequest:
-    return BadRequest("POST", path, status, code, named, content, {"content-type": kind} if kind else {})
+    headers = {"content-type": kind, "content-encoding": encoding}
+    return BadRequest(
+        "POST", path, status, code, named, content, {name: text for name, text in headers.items() if text}
+    )
 
 
 def form(file_name: bytes, content: bytes = b"", field: bytes = b"file") -> bytes:
@@ -49,24 +62,12 @@ def parameter(path: str, query: str, named: str, kind: str = CSV) -> BadRequest:
 
 
 BAD: list[BadRequest] = [
-    *(
-        parameter(path, f"name={name}", "name", kind)
-        for path, kind in ((DATASETS, CSV), (ROBOTS, XML))
-        for name in UNNAMED
-    ),
+    *(parameter(path, f"name={name}", "name", kind) for path, kind in TEXTS for name in UNNAMED),
     *(parameter(DATASETS, f"{name}={value}", named) for name, all_ in CHOICES.items() for value, named in all_.items()),
     parameter(ROBOTS, "joint_names=a", "joint_names", XML),
     *(parameter(IMPORT, f"name={name}", "name", TAR) for name in ("", "A", "a%20b", "..", "a%2fb", "a" * 65)),
-    *(
-        upload(path, b"{}", "content-type", kind, *TYPE)
-        for path in (DATASETS, ROBOTS, IMPORT)
-        for kind in ("", "text/plain", "application/octet-stream", "text/csvx", "*/*", "a" * 500)
-    ),
-    *(
-        upload(path, form(name), "file name", FORM, *TYPE)
-        for path in (DATASETS, ROBOTS, IMPORT)
-        for name in (b"data.xlsx", b"data", b".csv.exe")
-    ),
+    *(upload(path, b"{}", "content-type", kind, *TYPE) for path in PATHS for kind in UNSUPPORTED),
+    *(upload(path, form(name), "file name", FORM, *TYPE) for path in PATHS for name in UNSUPPORTED_FILES),
     upload(DATASETS, form("a\u202evsc.csv".encode()), "file name", FORM, "invalid_request"),
     upload(DATASETS, form(b"a\x07.csv"), "file name", FORM, "invalid_request"),
     upload(DATASETS, form(b""), "file", FORM, "invalid_request"),
@@ -78,15 +79,7 @@ BAD: list[BadRequest] = [
     *(upload(DATASETS, content, None) for content in (b"", b"q1,tau1\n", b"\x00" * 100, b"\xff\xfe")),
     *(upload(DATASETS, content, None, NPZ) for content in (b"", b"PK\x03\x04", b"\x93NUMPY", b"not a zip")),
     *(upload(ROBOTS, content, "urdf", XML) for content in (b"", b"<robot", b"<html/>", b"\xff", b'<robot name="a"/>')),
-    *(
-        upload(IMPORT, content, None, TAR)
-        for content in (b"", b"\0" * 1024, b"garbage", b"\x1f\x8b\x08", b"PK\x03\x04")
-    ),
+    *(upload(IMPORT, text, None, TAR) for text in (b"", b"\0" * 1024, b"garbage", b"\x1f\x8b\x08", b"PK\x03\x04")),
     upload(ROBOTS, b" " * (2 * 2**20 + 1), None, XML, "too_large", 413),
-    *(
-        BadRequest(
-            "POST", path, TYPE[1], TYPE[0], "Content-Encoding", b"", {"content-type": kind, "content-encoding": "gzip"}
-        )
-        for path, kind in ((DATASETS, CSV), (ROBOTS, XML))
-    ),
+    *(upload(path, b"", "Content-Encoding", kind, *TYPE, encoding="gzip") for path, kind in TEXTS),
 ]

@@ -80,6 +80,22 @@ class Serving:
         self.server = Server(config, None, self.stopping, notice_s)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
+    def connect(self, data: bytes = b"") -> "RawConnection":
+        """Return a new connection on which these bytes were sent."""
+        client = RawConnection(self.port)
+        client.send(data)
+        return client
+
+    def ask(self, request: bytes) -> tuple[int, bytes]:
+        """Return status and content of the answer on a connection of its own."""
+        with self.connect(request) as client:
+            return client.read_answer()
+
+    def refusal(self, request: bytes) -> tuple[int, str, str]:
+        """Return status, code and message of an error after which the server closes the connection."""
+        with self.connect(request) as client:
+            return error_of(client.read_to_end())
+
     @property
     def connections(self) -> int:
         """Return the number of open connections."""
@@ -106,6 +122,11 @@ class RawConnection:
     def send(self, data: bytes) -> None:
         """Send bytes."""
         self.socket.sendall(data)
+
+    def ask(self, request: bytes) -> tuple[int, bytes]:
+        """Return status and content of the answer to a request."""
+        self.send(request)
+        return self.read_answer()
 
     def read_to_end(self) -> bytes:
         """Return all bytes until the server closes; empty if it sends none."""

@@ -47,34 +47,33 @@ def run_middleware(middleware, request, client):
     asyncio.run(middleware(request, client, None))
 
 
+def refusal(middleware, request, client):
+    """Return the error with which a request ends."""
+    with pytest.raises(HTTPException) as caught:
+        run_middleware(middleware, request, client)
+    return caught.value
+
+
 @pytest.mark.parametrize(("path", "max_bytes"), [("/", 100), ("/large", 1000), ("/large/er", 100)])
 def test_max_body_size_depends_on_the_path(path, max_bytes):
     run_middleware(limit(read_body), scope(path, max_bytes), client_sending(bytes(max_bytes)))
     run_middleware(limit(read_body), scope(path), client_sending(bytes(max_bytes - 1), b"x"))
-    with pytest.raises(HTTPException) as announced:
-        run_middleware(limit(read_body), scope(path, max_bytes + 1), client_sending(b""))
-    with pytest.raises(HTTPException) as digits:
-        run_middleware(limit(read_body), scope(path, "9" * 5000), client_sending(b""))
-    with pytest.raises(HTTPException) as counted:
-        run_middleware(limit(read_body), scope(path), client_sending(bytes(max_bytes), b"x"))
-    for caught in (announced, digits, counted):
-        assert caught.value.status_code == 413
-        assert str(max_bytes) in caught.value.detail
+    for length, *pieces in ((max_bytes + 1, b""), ("9" * 5000, b""), (None, bytes(max_bytes), b"x")):
+        refused = refusal(limit(read_body), scope(path, length), client_sending(*pieces))
+        assert refused.status_code == 413
+        assert str(max_bytes) in refused.detail
 
 
 @pytest.mark.parametrize("pieces", [(), (b"a",), (b"a", b"b")], ids=["nothing", "one piece", "two pieces"])
 def test_body_that_never_ends_gets_408(pieces):
-    with pytest.raises(HTTPException) as caught:
-        run_middleware(limit(read_body, SOON), scope(), client_sending(*pieces, more=True))
-    assert caught.value.status_code == 408
-    assert f"{len(pieces)} bytes" in caught.value.detail
-    assert caught.value.headers == {"Connection": "close"}
+    refused = refusal(limit(read_body, SOON), scope(), client_sending(*pieces, more=True))
+    assert (refused.status_code, refused.headers) == (408, {"Connection": "close"})
+    assert f"{len(pieces)} bytes" in refused.detail
 
 
 def test_trickling_body_gets_408():
-    with pytest.raises(HTTPException) as caught:
-        run_middleware(limit(read_body, SOON), scope(), client_sending(*[b"x", SOON / 5] * 100, b"x"))
-    assert caught.value.status_code == 408
+    client = client_sending(*[b"x", SOON / 5] * 100, b"x")
+    assert refusal(limit(read_body, SOON), scope(), client).status_code == 408
 
 
 def test_large_body_may_take_longer():
@@ -99,28 +98,21 @@ def test_waiting_for_the_disconnect_has_no_limit():
     run_middleware(limit(events, SOON), scope(), client_sending(b"x"))
 
 
-def test_cancelled_request_gets_no_answer():
-    async def cancelled():
-        task = asyncio.create_task(limit(read_body)(scope(), client_sending(), None))
-        await asyncio.sleep(0)
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-
-    asyncio.run(cancelled())
+@pytest.mark.anyio
+async def test_cancelled_request_gets_no_answer():
+    task = asyncio.create_task(limit(read_body)(scope(), client_sending(), None))
+    await asyncio.sleep(0)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
 
 
-def test_concurrent_bodies_have_their_own_deadlines():
+@pytest.mark.anyio
+async def test_concurrent_bodies_have_their_own_deadlines():
     middleware = limit(read_body, SOON, bytes_per_s=100)
-
-    async def both():
-        return await asyncio.gather(
-            middleware(scope(), client_sending(), None),
-            middleware(scope(), client_sending(bytes(50), SOON * 3, b"x"), None),
-            return_exceptions=True,
-        )
-
-    late, in_time = asyncio.run(both())
+    clients = client_sending(), client_sending(bytes(50), SOON * 3, b"x")
+    answers = (middleware(scope(), each, None) for each in clients)
+    late, in_time = await asyncio.gather(*answers, return_exceptions=True)
     assert isinstance(late, HTTPException)
     assert in_time is None
 
@@ -132,24 +124,20 @@ def test_streams_and_lifespan_are_not_limited(kind):
     app.assert_awaited_once_with({"type": kind}, None, None)
 
 
-def test_concurrent_bodies_of_a_client_are_limited():
+@pytest.mark.anyio
+async def test_concurrent_bodies_of_a_client_are_limited():
     middleware, sent = limit(read_body, at_once=2), asyncio.Event()
 
     async def slow():
         await sent.wait()
         return {"type": "http.request", "body": b"x", "more_body": False}
 
-    async def run():
-        waiting = [asyncio.ensure_future(middleware(scope(), slow, None)) for _ in range(2)]
-        await asyncio.sleep(0)
-        with pytest.raises(HTTPException) as refused:
-            await middleware(scope(), client_sending(b"x"), None)
-        await middleware(scope(client="192.0.2.2"), client_sending(b"x"), None)  # another client's body is read
-        sent.set()
-        await asyncio.gather(*waiting)
+    waiting = [asyncio.create_task(middleware(scope(), slow, None)) for _ in range(2)]
+    await asyncio.sleep(0)
+    with pytest.raises(HTTPException, match=r"bodies from 192.0.2.1 at the same time: at most 2\.") as refused:
         await middleware(scope(), client_sending(b"x"), None)
-        return refused.value
-
-    refusal = asyncio.run(run())
-    assert (refusal.status_code, refusal.headers["Retry-After"]) == (429, "1")
-    assert "bodies from 192.0.2.1 at the same time: at most 2." in refusal.detail
+    assert (refused.value.status_code, refused.value.headers["Retry-After"]) == (429, "1")
+    await middleware(scope(client="192.0.2.2"), client_sending(b"x"), None)  # another client's body is read
+    sent.set()
+    await asyncio.gather(*waiting)
+    await middleware(scope(), client_sending(b"x"), None)

@@ -12,13 +12,12 @@ import lipcore
 from service.api.limits.upload import WRITE_BYTES
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings, shipped_models
-from service.models import registry
 from service.storage import disk as measuring
 from service.storage.database import Database, RobotRow
 from service.storage.database.engine import FILE, LOG_BYTES
 from service.storage.disk import Disk, measure
-from service.storage.files import new_id
 from tests.service.data import QUICK, arrays, error, npz, post, service_of, stream
+from tests.service.models.versions import publish
 
 KiB = 1024
 
@@ -38,15 +37,14 @@ def disk(tmp_path):
     return Disk(Settings(home=tmp_path, max_home_bytes=1000, min_free_bytes=0))
 
 
-def test_usage_of_a_home_excludes_link_targets(tmp_path):
-    (tmp_path / "home" / "a" / "b").mkdir(parents=True)
-    (tmp_path / "home" / "one").write_bytes(bytes(1000))
-    (tmp_path / "home" / "a" / "b" / "two").write_bytes(bytes(200))
-    (tmp_path / "outside").write_bytes(bytes(10_000))
-    for link, target in (("file", "outside"), ("folder", ""), ("nothing", "nowhere")):
-        (tmp_path / "home" / link).symlink_to(tmp_path / target)
-    links = sum((tmp_path / "home" / link).lstat().st_size for link in ("file", "folder", "nothing"))
-    assert measure(tmp_path / "home") == 1200 + links
+def test_usage_of_a_home_excludes_link_targets(tmp_path, home):
+    (home / "a" / "b").mkdir(parents=True)
+    for file, size in ((home / "one", 1000), (home / "a" / "b" / "two", 200), (tmp_path / "outside", 10_000)):
+        file.write_bytes(bytes(size))
+    links = {home / "file": "outside", home / "folder": "", home / "nothing": "nowhere"}
+    for link, target in links.items():
+        link.symlink_to(tmp_path / target)
+    assert measure(home) == 1200 + sum(link.lstat().st_size for link in links)
     assert measure(tmp_path / "nowhere") == 0
 
 
@@ -129,12 +127,9 @@ def test_unpacked_data_must_fit_the_quota(api, monkeypatch):
 
 
 def test_full_disk_rejects_observations_but_knows_repeated_ones(api, monkeypatch):
-    service, folder = service_of(api), new_id("mv")
-    manifest = lipcore.copy_model(shipped_models() / "panda-sim", service.files.versions / folder)
-    with service.database.transaction() as session:
-        registry.publish(session, "limits-taught", folder, manifest, None)
-    rows = {"dq": [[0.0] * 7] * 2, "ddq": [[0.0] * 7] * 2, "tau": [[0.0] * 7] * 2}
-    body = {"stream_id": "limits-full", "sequence": 0, "t": [0.0, 0.01], "q": [[0.1] * 7] * 2, **rows}
+    publish(api, "limits-taught", lipcore.load(shipped_models() / "panda-sim"))
+    rows = {name: [[0.1] * 7] * 2 for name in ("q", "dq", "ddq", "tau")}
+    body = {"stream_id": "limits-full", "sequence": 0, "t": [0.0, 0.01], **rows}
     address = "/v1/models/limits-taught/observations"
     assert api.post(address, json=body).status_code == 200
     monkeypatch.setattr(service_of(api).disk, "quota", 1)

@@ -48,9 +48,9 @@ def send(client, body, kind, path="/v1/datasets"):
     return client.post(path, content=body, headers={"content-type": kind})
 
 
-def rejection(reply, status=422, code="invalid_data"):
-    """Upload a file that is rejected; return the error."""
-    return error(reply, status, code)["message"]
+def rejection(client, body, kind, path="/v1/datasets", answered=(422, "invalid_data")):
+    """Upload a file that is rejected; return the message."""
+    return error(send(client, body, kind, path), *answered)["message"]
 
 
 def parquet(values):
@@ -74,14 +74,14 @@ def test_parquet_page_that_claims_two_gigabytes(narrow, again):
     page = pq.ParquetFile(io.BytesIO(body)).metadata.row_group(0).column(0).data_page_offset
     first = b"\x80\x01" if again[:1] == b"\x05" else b"\xfe\xff\xff\xff\x0f"
     header = b"\x15\x00\x15" + first + b"\x15\x80\x01" + again + b"\x00"
-    message = rejection(send(narrow, body[:page] + header + body[page + len(header) :], PARQUET))
+    message = rejection(narrow, body[:page] + header + body[page + len(header) :], PARQUET)
     assert "bytes of memory" in message
     assert "LIPSERVE_PARSER_MEMORY_BYTES" in message
 
 
 def test_parquet_footer_that_claims_two_gigabytes(narrow):
     body = parquet(np.arange(9.0))[:-8] + struct.pack("<I4s", 2**31 - 1, b"PAR1")
-    assert "The file could not be read" in rejection(send(narrow, body, PARQUET))
+    assert "The file could not be read" in rejection(narrow, body, PARQUET)
 
 
 def test_zip_bomb(narrow):
@@ -94,7 +94,7 @@ def test_zip_bomb(narrow):
                 for _ in range(80):
                     member.write(bytes(MiB))
     assert len(out.getvalue()) < MiB
-    assert "expected at most 104857600" in rejection(send(narrow, out.getvalue(), NPZ), 413, "too_large")
+    assert "expected at most 104857600" in rejection(narrow, out.getvalue(), NPZ, answered=(413, "too_large"))
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_zip_with_too_many_members(narrow):
     entry = b"PK\x01\x02" + bytes([20, 0, 20, 0]) + bytes(20) + b"\x01\0" + bytes(16) + b"a"
     count = 1_000_000
     end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 65535, 65535, len(entry) * count, 4, 0)
-    message = rejection(send(narrow, b"PK\x03\x04" + entry * count + end, NPZ))
+    message = rejection(narrow, b"PK\x03\x04" + entry * count + end, NPZ)
     assert "LIPSERVE_PARSER" in message  # the memory limit or, on a slow machine, the time limit
 
 
@@ -126,48 +126,41 @@ def computing_bag(path):
 def test_computing_bag_does_not_block_others(narrow, tmp_path):
     body = computing_bag(tmp_path / "bag.db3")
     with ThreadPoolExecutor() as pool:
-        long = pool.submit(send, narrow, body, BAG)
+        long = pool.submit(rejection, narrow, body, BAG)
         assert narrow.get("/health/live").status_code == 200
         assert send(narrow, GOOD, CSV).status_code == 201
-        message = rejection(long.result())
+        message = long.result()
     assert "1 s of processor time" in message
     assert "LIPSERVE_PARSER_S" in message
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        pytest.param("[" * 100_000 + "]" * 100_000, id="lists"),
-        pytest.param(('{"t": ' + "[" * 100_000 + "]" * 100_000 + "}\n") * 2, id="a value"),
-        pytest.param(json.dumps([{"a": [{"b": [[[[[[[[[[[[1]]]]]]]]]]]]}]}] * 40), id="values"),
-    ],
-)
-def test_deeply_nested_files_are_rejected(narrow, body):
-    assert "deep" in rejection(send(narrow, body, JSON))
+LISTS = "[" * 100_000 + "]" * 100_000
+HOSTILE = {
+    "lists": (LISTS, JSON, "/v1/datasets", "deep"),
+    "a value": ((f'{{"t": {LISTS}}}\n') * 2, JSON, "/v1/datasets", "deep"),
+    "values": (json.dumps([{"a": [{"b": [[[[[[[[[[[[1]]]]]]]]]]]]}]}] * 40), JSON, "/v1/datasets", "deep"),
+    "billion laughs": (LAUGHS, XML, ROBOTS, "document type"),
+    "nested elements": ("<robot>" + "<a>" * 100_000, XML, ROBOTS, "more than 32 deep"),
+    "mesh file name": (MESH, XML, ROBOTS, "no joint"),
+}
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        pytest.param(LAUGHS, "document type", id="billion laughs"),
-        pytest.param("<robot>" + "<a>" * 100_000, "more than 32 deep", id="nested elements"),
-        pytest.param(MESH, "no joint", id="mesh file name"),
-    ],
-)
-def test_hostile_urdfs_are_rejected(narrow, text, words):
-    assert words in rejection(send(narrow, text, XML, ROBOTS))
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_hostile_texts_are_rejected(narrow, kind):
+    body, media_type, path, words = HOSTILE[kind]
+    assert words in rejection(narrow, body, media_type, path)
 
 
 def test_tensors_that_claim_a_larger_size_are_rejected(narrow):
     files = unpack(exported(narrow, "panda-sim"))
     lie = with_header(files, lambda tensors: tensors["statistics/b"].update(shape=[10**9]))
-    assert rejection(send(narrow, pack(lie), TAR, IMPORT)).startswith("model.safetensors: ")
+    assert rejection(narrow, pack(lie), TAR, IMPORT).startswith("model.safetensors: ")
 
 
 def test_crash_of_a_reader_is_no_failure_of_the_service(narrow, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("service.datasets.store.READER", "tests.service.runtime.inmates:crash_reader")
-        message = rejection(send(narrow, GOOD, CSV))
+        message = rejection(narrow, GOOD, CSV)
     assert "could not be read: its reader was ended by SIGSEGV" in message
     assert send(narrow, GOOD, CSV).status_code == 201
 

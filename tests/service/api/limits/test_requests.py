@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+from unittest.mock import AsyncMock
 
 import pytest
 
@@ -10,21 +11,20 @@ from service.api.limits.requests import OTHERS, BodyLimit, Gate, Rate, RateLimit
 from service.app import create_app
 from service.foundation.settings import Settings
 
+pytestmark = pytest.mark.anyio
 MODELS, STREAM = "/v1/models", "/v1/echo/stream"
 
 
 async def call(middleware, path=MODELS, kind="http"):
     """Call a middleware; return the messages of the answer."""
-    sent = []
-
-    async def send(message):
-        sent.append(message)
-
-    async def receive():
-        return {"type": "websocket.connect"}
-
+    send, receive = AsyncMock(), AsyncMock(return_value={"type": "websocket.connect"})
     await middleware({"type": kind, "path": path, "headers": [], "client": ("10.0.0.1", 1)}, receive, send)
-    return sent
+    return [each.args[0] for each in send.await_args_list]
+
+
+async def succeed(_, __, send):
+    """An application that answers."""
+    await send({"type": "http.response.start", "status": 200, "headers": []})
 
 
 def error_of(sent, status):
@@ -36,37 +36,31 @@ def error_of(sent, status):
 @pytest.mark.parametrize(
     ("path", "kind"), [("/health/live", "http"), (STREAM, "websocket"), ("", "lifespan")], ids=["health", "ws", "start"]
 )
-def test_full_gate_rejects_requests_but_not_health_or_streams(path, kind):
-    async def send_requests():
-        go = asyncio.Event()
+async def test_full_gate_rejects_requests_but_not_health_or_streams(path, kind):
+    go = asyncio.Event()
 
-        async def app(_, __, send):
-            await go.wait()
-            await send({"type": "http.response.start", "status": 200, "headers": []})
+    async def app(*arguments):
+        await go.wait()
+        await succeed(*arguments)
 
-        gate = Gate(app, 2)
-        tasks = [asyncio.create_task(call(gate)) for _ in range(2)]
-        await asyncio.sleep(0)
-        headers, error = error_of(await call(gate), 429)
-        assert (headers[b"retry-after"], error["code"]) == (b"1", "busy")
-        tasks.append(asyncio.create_task(call(gate, path, kind)))
-        await asyncio.sleep(0)
-        go.set()
-        answers = [*await asyncio.gather(*tasks), await call(gate)]
-        assert [sent[0]["status"] for sent in answers] == [200] * 4
-        assert gate.open == 0
-
-    asyncio.run(send_requests())
+    gate = Gate(app, 2)
+    tasks = [asyncio.create_task(call(gate)) for _ in range(2)]
+    await asyncio.sleep(0)
+    headers, error = error_of(await call(gate), 429)
+    assert (headers[b"retry-after"], error["code"]) == (b"1", "busy")
+    tasks.append(asyncio.create_task(call(gate, path, kind)))
+    await asyncio.sleep(0)
+    go.set()
+    answers = [*await asyncio.gather(*tasks), await call(gate)]
+    assert [sent[0]["status"] for sent in answers] == [200] * 4
+    assert gate.open == 0
 
 
-def test_failed_request_frees_its_place():
-    async def app(*_):
-        raise ZeroDivisionError
-
-    gate = Gate(app, 1)
+async def test_failed_request_frees_its_place():
+    gate = Gate(AsyncMock(side_effect=ZeroDivisionError), 1)
     for _ in range(3):
         with pytest.raises(ZeroDivisionError):
-            asyncio.run(call(gate))
+            await call(gate)
     assert gate.open == 0
 
 
@@ -111,22 +105,16 @@ def test_client_is_identified_by_key_or_address(client, expected):
     assert client_of({"client": client, KEY_ID: "key_1"}) == "API key key_1"
 
 
-def test_requests_beyond_the_rate_get_429():
-    async def fine(_, __, send):
-        await send({"type": "http.response.start", "status": 200, "headers": []})
-
-    async def send_requests():
-        limited = RateLimit(fine, per_s=0.001, burst=2)
-        assert [(await call(limited))[0]["status"] for _ in range(2)] == [200, 200]
-        headers, error = error_of(await call(limited), 429)
-        assert 900 < int(headers[b"retry-after"]) <= 1000
-        assert error["code"] == "rate_limited"
-        assert "Too many requests from 10.0.0.1: at most 0.001 per s" in error["message"]
-        assert isinstance(error_of(await call(limited, "/v2/models/panda-sim/infer"), 429)[1], str)
-        assert (await call(limited, STREAM, "websocket"))[0]["status"] == 429
-        assert (await call(limited, "/health/live"))[0]["status"] == 200
-
-    asyncio.run(send_requests())
+async def test_requests_beyond_the_rate_get_429():
+    limited = RateLimit(succeed, per_s=0.001, burst=2)
+    assert [(await call(limited))[0]["status"] for _ in range(2)] == [200, 200]
+    headers, error = error_of(await call(limited), 429)
+    assert 900 < int(headers[b"retry-after"]) <= 1000
+    assert error["code"] == "rate_limited"
+    assert "Too many requests from 10.0.0.1: at most 0.001 per s" in error["message"]
+    assert isinstance(error_of(await call(limited, "/v2/models/panda-sim/infer"), 429)[1], str)
+    assert (await call(limited, STREAM, "websocket"))[0]["status"] == 429
+    assert (await call(limited, "/health/live"))[0]["status"] == 200
 
 
 def test_middlewares_are_in_order(home):

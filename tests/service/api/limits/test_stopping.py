@@ -35,8 +35,7 @@ serve(config, None, 0, StopState())
 
 def begin_request(serving):
     """Send a request that waits for `go`, and return its connection."""
-    client = RawConnection(serving.port)
-    client.send(HELD)
+    client = serving.connect(HELD)
     eventually(lambda: serving.app.begun == 1)
     return client
 
@@ -47,8 +46,7 @@ def test_stopping_server_answers_during_its_notice_period():
         serving.server.should_exit = True
         eventually(lambda: serving.stopping.begun)
         with RawConnection(serving.port) as client:
-            client.send(GET)
-            assert client.read_answer() == (200, b"hello")
+            assert client.ask(GET) == (200, b"hello")
             eventually(serving.stopping.closing.is_set)
             assert client.read_to_end() == b""
         with pytest.raises(ConnectionError):
@@ -73,13 +71,8 @@ def test_answers_that_take_too_long_are_dropped():
 
 
 def test_second_signal_stops_at_once():
-    process = subprocess.Popen(
-        [sys.executable, "-c", NEVER_ANSWERING_SERVER],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        bufsize=1,
-    )
+    command, pipe = [sys.executable, "-c", NEVER_ANSWERING_SERVER], subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=subprocess.STDOUT, text=True, bufsize=1)
     try:
         lines = iter(process.stdout.readline, "")
         port = next(line for line in lines if "running on" in line).split("127.0.0.1:")[1].split()[0]

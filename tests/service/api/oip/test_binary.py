@@ -10,19 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.testing import assert_array_equal
 
-from tests.service.api.oip.requests import (
-    HEADER,
-    binary_input,
-    binary_tensors,
-    error_message,
-    infer,
-    infer_binary,
-    infer_path,
-    json_input,
-    message,
-    pack_numbers,
-)
-from tests.service.api.oip.requests import tensors as tensors_of
+from tests.service.api.oip import requests as oip
+from tests.service.api.oip.requests import HEADER, error_message, infer, infer_binary, json_input, message, pack_numbers
 
 Q, DQ, DDQ = [0.3, -0.7], [1.1, 0.2], [-2.0, 0.9]
 MOTION = {"q": Q, "dq": DQ, "ddq": DDQ}
@@ -31,7 +20,7 @@ NAMES = ("tau", "tau_std", "noise_std", "covariance", "tau_friction", "inertia_m
 
 
 def request(motion, datatype="FP64", **more):
-    return {"inputs": [binary_input(name, values, datatype) for name, values in motion.items()], **more}
+    return {"inputs": [oip.binary_input(name, values, datatype) for name, values in motion.items()], **more}
 
 
 def payload(motion, datatype="FP64"):
@@ -42,7 +31,7 @@ TEXT, DATA = json.dumps(request(MOTION)).encode(), payload(MOTION)
 
 
 def post(api, body, length):
-    return api.post(infer_path("pendulum"), content=body, headers={HEADER: str(length)})
+    return api.post(oip.infer_path("pendulum"), content=body, headers={HEADER: str(length)})
 
 
 def test_bytes_of_a_query_and_its_answer(api, trained):
@@ -54,11 +43,8 @@ def test_bytes_of_a_query_and_its_answer(api, trained):
         b'"outputs":[{"name":"tau","parameters":{"binary_data":true}}]}'
     )
     body = head + struct.pack("<2d", 0.3, -0.7) + struct.pack("<2d", 1.1, 0.2) + struct.pack("<2f", -2.0, 0.5)
-    answer = api.post(
-        f"/v2/models/{trained.name}/infer",
-        content=body,
-        headers={"Inference-Header-Content-Length": str(len(head)), "content-type": "application/octet-stream"},
-    )
+    headers = {"Inference-Header-Content-Length": str(len(head)), "content-type": "application/octet-stream"}
+    answer = api.post(f"/v2/models/{trained.name}/infer", content=body, headers=headers)
     tau, _ = trained.model.answer(np.array([[0.3, -0.7], [1.1, 0.2], [-2.0, 0.5]]), std=False)
     text = (
         b'{"model_name":"pendulum","model_version":"1",'
@@ -82,7 +68,7 @@ def request_pair(draw):
         values = draw(arrays(f"f{width // 8}", shape, elements=st.floats(-12, 12, width=width)))
         plain.append(json_input(name, values, datatype))
         if draw(st.booleans()):
-            mixed.append(binary_input(name, values, datatype))
+            mixed.append(oip.binary_input(name, values, datatype))
             rest += pack_numbers(values, datatype)
         else:
             mixed.append(plain[-1])
@@ -102,14 +88,14 @@ def request_pair(draw):
 @given(request_pair())
 def test_binary_and_json_agree_bit_for_bit(api, trained, both):
     plain, mixed, rest, binary = both
-    expected = tensors_of(infer(api, trained.name, plain))
+    expected = oip.tensors(infer(api, trained.name, plain))
     answer = infer_binary(api, trained.name, mixed, rest)
     if binary:
-        head, tensors = binary_tensors(answer)
+        head, tensors = oip.binary_tensors(answer)
         assert [each["name"] for each in head["outputs"] if "data" not in each] == binary
     else:
         assert (answer.status_code, HEADER in answer.headers) == (200, False), answer.text
-        tensors = tensors_of(answer.json())
+        tensors = oip.tensors(answer.json())
     assert list(tensors) == list(expected)
     for name, values in expected.items():
         assert_array_equal(tensors[name], values, err_msg=name)
@@ -130,7 +116,7 @@ def test_corrupted_message_is_answered_or_rejected(api, trained, changes, furthe
         body[place] = value
     answer = post(api, bytes(body), len(TEXT) + further)
     if answer.status_code == 200:
-        assert all(np.isfinite(values).all() for values in tensors_of(answer.json()).values())
+        assert all(np.isfinite(values).all() for values in oip.tensors(answer.json()).values())
     else:
         error_message(answer)
 
@@ -139,9 +125,8 @@ def test_corrupted_message_is_answered_or_rejected(api, trained, changes, furthe
 def test_sizes_must_match_the_shapes(api, trained, size):
     wrong = request(MOTION)
     wrong["inputs"][1]["parameters"]["binary_data_size"] = size
-    message = error_message(
-        infer_binary(api, trained.name, wrong, pack_numbers(Q) + b"\0" * min(size, 100) + pack_numbers(DDQ))
-    )
+    data = pack_numbers(Q) + b"\0" * min(size, 100) + pack_numbers(DDQ)
+    message = error_message(infer_binary(api, trained.name, wrong, data))
     if size == 2**40:  # the service neither waits for that many bytes nor reserves memory for them
         assert f"expected {2**40 + 32} bytes" in message
     else:
@@ -157,10 +142,11 @@ def test_wrong_json_length_is_rejected(api, trained, value):
 
 
 def test_binary_data_need_the_json_length(api, trained):
-    reply = error_message(api.post(infer_path(trained.name), content=TEXT + DATA))
+    path = oip.infer_path(trained.name)
+    reply = error_message(api.post(path, content=TEXT + DATA))
     assert reply.startswith("The body is not JSON: ")
     assert f"give its length in {HEADER}" in reply
-    assert HEADER in error_message(api.post(infer_path(trained.name), content=TEXT))
+    assert HEADER in error_message(api.post(path, content=TEXT))
 
 
 @pytest.mark.parametrize("datatype", ["FP64", "FP32"])

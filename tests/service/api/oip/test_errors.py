@@ -1,6 +1,7 @@
 """Errors of the Open Inference Protocol: in its shape, with field, value and expected value."""
 
 import json
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,78 +12,30 @@ from hypothesis import strategies as st
 from lipcore.model import dynamics
 from service.api.errors import UNEXPECTED_ERROR
 from service.api.oip import query as answering
-from tests.service.api.oip.requests import error_message, infer_path, message
+from tests.service.api.oip.requests import changed, error_message, infer_path, message, wrong_requests
 from tests.service.data import ADDRESS
 
 MOTION = {"q": [0.3, -0.7], "dq": [1.1, 0.2], "ddq": [-2.0, 0.9]}
 PATH = infer_path("pendulum")
-JOINTS = "[2] for one query or [N, 2] for a batch: the joints are joint1, joint2"
-OTHERS = "tensors in the body: the only supported extension is binary_tensor_data"
-
-
-def changed(place, **changes):
-    """Return a correct request with one changed input; None removes a member."""
-    entire = message(MOTION)
-    wrong = entire["inputs"][place] | changes
-    entire["inputs"][place] = {key: value for key, value in wrong.items() if value is not None}
-    return entire
 
 
 def rejection(api, request, status=400):
     return error_message(api.post(PATH, json=request), status)
 
 
-def asking(name, **parameters):
-    return message(MOTION) | {"outputs": [{"name": name, "parameters": parameters}]}
-
-
-REGION = {"shared_memory_region": "r"}
-WRONG = {
-    "unknown input": (changed(0, name="p"), "inputs[0].name is p, expected one of q, dq, ddq"),
-    "input twice": (changed(1, name="q"), "Input `q` is given twice."),
-    "no inputs": ({"inputs": []}, "Input `q` is missing. Required inputs: q, dq, ddq."),
-    "datatype": (changed(0, datatype="INT32"), "q.datatype is INT32, expected FP64 or FP32"),
-    "joints": (changed(0, shape=[3]), f"q.shape is [3], expected {JOINTS}"),
-    "no queries": (changed(0, shape=[0, 2]), f"q.shape is [0, 2], expected {JOINTS}"),
-    "huge": (changed(0, shape=[10**30, 2]), f"q.shape is [{10**30}, 2], expected at most"),
-    "other shape": (changed(1, shape=[1, 2]), "dq.shape is [1, 2], expected that of q, [2]"),
-    "too few": (changed(1, data=[1.0]), "`dq.data` has 1 numbers, expected 2 numbers, flat or in rows, for shape [2]."),
-    "row": (changed(1, data=[[0.0, 0.0]]), "`dq.data` has rows of shape [1, 2], expected 2 numbers"),
-    "mixed": (changed(1, data=[0.0, [0.0]]), "`dq.data` has numbers and lists, or lists of"),
-    "no data": (changed(1, data=None), "Input `dq` has neither `data` nor `binary_data_size`."),
-    "data twice": (changed(1, parameters={"binary_data_size": 0}), "Input `dq` has both `data` and `binary_"),
-    "shared memory": (
-        changed(1, data=None, parameters=REGION),
-        f"dq.parameters.shared_memory_region is r, expected {OTHERS}",
+WRONG = wrong_requests(MOTION, "joint1, joint2") | {
+    "huger": (changed(MOTION, 0, shape=[10**30, 2]), f"q.shape is [{10**30}, 2], expected at most"),
+    "too few": (
+        changed(MOTION, 1, data=[1.0]),
+        "`dq.data` has 1 numbers, expected 2 numbers, flat or in rows, for shape [2].",
     ),
-    "shared for an output": (asking("tau", **REGION), "outputs[0].parameters.shared_memory_region is r, ex"),
-    "classification": (
-        asking("tau", classification=3),
-        f"outputs[0].parameters.classification is 3, expected {OTHERS}",
-    ),
-    "output": (message(MOTION, "tau", "torque"), "outputs[1].name is torque, expected an output of"),
-    "output twice": (message(MOTION, "tau", "tau"), "Output `tau` is requested twice."),
-    "no torque": (
-        message(MOTION, "forward_dynamics_std"),
-        "`tau` is required for forward_dynamics or tau_external.",
-    ),
-    "torque in vain": (
-        message(MOTION | {"tau": [0.0, 0.0]}, "tau"),
-        "`tau` is used only for forward_dynamics or tau_external, which is not among the outputs",
-    ),
-    "other model": (
-        message(MOTION, model_name="x"),
-        "model_name is x, expected pendulum, as in the path",
-    ),
-    "other version": (
-        message(MOTION, model_version="2"),
-        "model_version is 2, expected 1, as in the path",
-    ),
-    "degrees": (
-        changed(0, data=[0.0, 90.0]),
-        "q[1] is 90, expected radians (or metres) within ±12.6: are these degrees?",
-    ),
-    "FP32": (changed(2, datatype="FP32", data=[1e39, 0.0]), "ddq[0] is inf, expected a finite number of FP32"),
+    "row": (changed(MOTION, 1, data=[[0.0, 0.0]]), "`dq.data` has rows of shape [1, 2], expected 2 numbers"),
+    "mixed": (changed(MOTION, 1, data=[0.0, [0.0]]), "`dq.data` has numbers and lists, or lists of"),
+    "no data": (changed(MOTION, 1, data=None), "Input `dq` has neither `data` nor `binary_data_size`."),
+    "data twice": (changed(MOTION, 1, parameters={"binary_data_size": 0}), "Input `dq` has both `data` and `binary_"),
+    "other model": (message(MOTION, model_name="x"), "model_name is x, expected pendulum, as in the path"),
+    "other version": (message(MOTION, model_version="2"), "model_version is 2, expected 1, as in the path"),
+    "FP32": (changed(MOTION, 2, datatype="FP32", data=[1e39, 0.0]), "ddq[0] is inf, expected a finite number of FP32"),
 }
 
 
@@ -166,10 +119,7 @@ def test_singular_inertia_error_names_the_query(api, trained, monkeypatch):
 
 @pytest.mark.parametrize("rows", [1, 2])
 def test_non_finite_answers_are_rejected(api, trained, monkeypatch, rows):
-    def overflowing(model, query, names):
-        return {name: np.full((rows, 2), np.inf) for name in names}
-
-    monkeypatch.setattr(answering, "compute", overflowing)
+    monkeypatch.setattr(answering, "compute", lambda *_: {"tau": np.full((rows, 2), np.inf)})
     batch = {name: np.tile(values, (rows, 1)) for name, values in MOTION.items()}
     reply = rejection(api, message(batch, "tau"))
     assert reply == "tau[0][0] is inf, expected a finite number: are dq in rad/s and ddq in rad/s²?"
@@ -188,10 +138,7 @@ def test_compressed_bodies_are_rejected(api, trained):
 
 
 def test_unexpected_errors_reveal_no_internals(api, trained, monkeypatch):
-    def broken(*_):
-        raise RuntimeError("secret")
-
-    monkeypatch.setattr(answering, "compute", broken)
+    monkeypatch.setattr(answering, "compute", Mock(side_effect=RuntimeError("secret")))
     quiet = TestClient(api.app, ADDRESS, raise_server_exceptions=False)
     reply = error_message(quiet.post(PATH, json=message(MOTION)), 500)
     assert reply == UNEXPECTED_ERROR

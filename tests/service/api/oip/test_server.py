@@ -9,27 +9,16 @@ from numpy.testing import assert_array_equal
 from tritonclient.utils import InferenceServerException
 
 from service import __version__
-from tests.service.api.oip.requests import infer_path, message, tensors
+from tests.service.api.oip.requests import BATCH, MOTION, json_answer
 from tests.service.data import DEADLINE
 
 pytestmark = pytest.mark.slow  # needs Triton's client
-
-MOTION = {"q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], "dq": [0.1] * 7, "ddq": [0.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0]}
-BATCH = {name: np.linspace(values, np.array(values) + 0.3, 4) for name, values in MOTION.items()}
-PATH = infer_path("panda-sim")
 
 
 @pytest.fixture(scope="module")
 def client(server) -> Iterator[triton.InferenceServerClient]:
     with triton.InferenceServerClient(server.url.removeprefix("http://"), network_timeout=DEADLINE) as connected:
         yield connected
-
-
-def json_answer(server, motion, *outputs):
-    """Return the service's answer in JSON."""
-    answer = server.client.post(PATH, json=message(motion, *outputs))
-    assert answer.status_code == 200, answer.text
-    return tensors(answer.json())
 
 
 def inputs(motion, binary=True):

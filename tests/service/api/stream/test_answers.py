@@ -34,19 +34,21 @@ def assert_agrees(answer, model, motion, std=True):
         assert answer.std is None
 
 
+def refusal(server, path=STREAM, **options):
+    """Return status and error of a stream that is not opened."""
+    with pytest.raises(InvalidStatus) as refused, open_stream(server, path, **options):
+        pass
+    body = json.loads(refused.value.response.body)
+    assert set(body) == {"error"}
+    return refused.value.response.status_code, body["error"]
+
+
 def test_hello_describes_the_answers(streaming):
     with open_stream(streaming.server) as connection:
         reply = read_hello(connection)
     noise = reply.pop("noise_std")
-    assert reply == {
-        "layout": 1,
-        "model": "pendulum",
-        "version": 1,
-        "revision": 0,
-        "joint_names": list(streaming.model.joint_names),
-        "torque_convention": "gravity_included",
-        "max_position": 12.6,
-    }
+    served = {"model": "pendulum", "version": 1, "revision": 0, "joint_names": list(streaming.model.joint_names)}
+    assert reply == served | {"layout": 1, "torque_convention": "gravity_included", "max_position": 12.6}
     np.testing.assert_allclose(noise, streaming.model.noise_std, rtol=1e-12)
 
 
@@ -88,15 +90,10 @@ def test_frames_sent_ahead_are_answered_in_order(streaming):
     ],
 )
 def test_wrong_address_gets_an_http_error(streaming, path, status, message):
-    with pytest.raises(InvalidStatus) as refused, open_stream(streaming.server, path):
-        pass
-    response = refused.value.response
-    assert response.status_code == status
-    body = json.loads(response.body)
-    assert set(body) == {"error"}
-    assert body["error"]["code"] == {404: "not_found", 422: "invalid_request"}[status]
-    assert message in body["error"]["message"]
-    assert body["error"]["detail"]
+    answered, problem = refusal(streaming.server, path)
+    assert (answered, problem["code"]) == (status, {404: "not_found", 422: "invalid_request"}[status])
+    assert message in problem["message"]
+    assert problem["detail"]
 
 
 def test_pages_of_other_sites_are_rejected(streaming):
@@ -104,10 +101,8 @@ def test_pages_of_other_sites_are_rejected(streaming):
     with open_stream(streaming.server, origin=own) as connection:
         assert read_hello(connection)["version"] == 1
     for origin in ("http://elsewhere.example", "null", "http://[", f"http://127.0.0.1:{streaming.server.port + 1}"):
-        with pytest.raises(InvalidStatus) as refused, open_stream(streaming.server, origin=origin):
-            pass
-        assert refused.value.response.status_code == 403
-        assert json.loads(refused.value.response.body)["error"]["code"] == "forbidden"
+        status, problem = refusal(streaming.server, origin=origin)
+        assert (status, problem["code"]) == (403, "forbidden")
 
 
 def test_messages_are_not_compressed(streaming):
@@ -119,11 +114,8 @@ def test_messages_are_not_compressed(streaming):
 
 def test_model_without_a_serving_version_is_rejected(streaming):
     train(streaming.server.client, "waiting", streaming.dataset, promotion="ask")
-    with pytest.raises(InvalidStatus) as refused, open_stream(streaming.server, "/v1/models/waiting/stream"):
-        pass
-    assert refused.value.response.status_code == 409
-    problem = json.loads(refused.value.response.body)["error"]
-    assert problem["code"] == "no_serving_version"
+    status, problem = refusal(streaming.server, "/v1/models/waiting/stream")
+    assert (status, problem["code"]) == (409, "no_serving_version")
     assert "`lipserve models promote waiting 1`" in problem["message"]
 
 

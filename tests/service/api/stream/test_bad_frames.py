@@ -81,13 +81,18 @@ def test_largest_position_is_allowed_with_either_sign(streaming):
         assert send_frame(connection, frame([[0, -np.nextafter(12.6, 13)], [0, 0], [0, 0]])).error is not None
 
 
-def test_giant_frame_closes_the_stream_before_it_is_read(streaming):
-    with open_stream(streaming.server) as connection:
+def close_frame(server, message, **options):
+    """Send a message after which the server closes the stream; return its close frame."""
+    with open_stream(server) as connection:
         read_hello(connection)
-        connection.send(bytes(64 * 1024 + 1))
+        connection.send(message, **options)
         with pytest.raises(ConnectionClosedError) as ended:
             connection.recv(DEADLINE)
-    assert ended.value.rcvd.code == 1009
+    return ended.value.rcvd
+
+
+def test_giant_frame_closes_the_stream_before_it_is_read(streaming):
+    assert close_frame(streaming.server, bytes(64 * 1024 + 1)).code == 1009
     with open_stream(streaming.server) as connection:
         read_hello(connection)
         assert send_frame(connection, bytes(64 * 1024)).error["code"] == "invalid_request"
@@ -95,12 +100,8 @@ def test_giant_frame_closes_the_stream_before_it_is_read(streaming):
 
 def test_invalid_text_closes_the_stream_with_a_short_reason(streaming):
     before = len(streaming.server.log.read_text())
-    with open_stream(streaming.server) as connection:
-        read_hello(connection)
-        connection.send(b"\xff\xfe", text=True)
-        with pytest.raises(ConnectionClosedError) as ended:
-            connection.recv(DEADLINE)
-    assert (ended.value.rcvd.code, ended.value.rcvd.reason) == (1007, "a text message is not UTF-8")
+    closed = close_frame(streaming.server, b"\xff\xfe", text=True)
+    assert (closed.code, closed.reason) == (1007, "a text message is not UTF-8")
     with open_stream(streaming.server) as connection:
         read_hello(connection)
         connection.send([b"caf", b"\xc3", b"\xa9"], text=True)  # a character may be split between two pieces

@@ -4,7 +4,6 @@ import asyncio
 import json
 import threading
 import time
-from functools import wraps
 from time import perf_counter
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -25,6 +24,7 @@ from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, MOTION, STD, TA
 
 QUICK = {"stream_flush_rows": 100, "stream_flush_s": 0.01}
 NEVER = 3600.0
+pytestmark = pytest.mark.anyio
 
 
 class FakeLearners:
@@ -69,8 +69,7 @@ class SessionClient:
         self.learners.settings, self.learners.loaded = Settings(**{**QUICK, **settings}), loaded
         self.connection = SimpleNamespace(arrived=perf_counter(), abort=self.aborted.set, scope={"subprotocols": []})
         client = self.connection, self.messages.get, self.send
-        meter = Meters().stream("m")
-        self.session = Session(*client, self.learners, self.current, meter, pinned, std, stream_id)
+        self.session = Session(*client, self.learners, self.current, Meters().stream("m"), pinned, std, stream_id)
 
     async def __aenter__(self):
         self.messages.put_nowait({"type": "websocket.connect"})
@@ -101,17 +100,18 @@ class SessionClient:
         """Return the last sequence of the next acknowledgement."""
         return (await self.text())["learnt"]["through"]
 
-    async def answer(self):
-        return read((await self.next())["bytes"])
+    async def answers(self, *frames):
+        """Send frames; return their answers."""
+        self.put(*frames)
+        return [read((await self.next())["bytes"]) for _ in frames]
 
     def put(self, *frames):
         for each in frames:
             self.messages.put_nowait({"type": "websocket.receive", "bytes": each})
 
-    async def send_torques(self, *sequences, **options):
+    async def send_torques(self, *sequences):
         """Send frames with torque; return their answers."""
-        self.put(*[frame(sequence=sequence, tau=TAU, **options) for sequence in sequences])
-        return [await self.answer() for _ in sequences]
+        return await self.answers(*[frame(sequence=sequence, tau=TAU) for sequence in sequences])
 
     async def run_pending(self):
         """Let all runnable tasks run."""
@@ -119,24 +119,12 @@ class SessionClient:
             await asyncio.sleep(0)
 
 
-def run_async(test):
-    """Run an asynchronous test."""
-
-    @wraps(test)
-    def run(*arguments, **more):
-        asyncio.run(asyncio.wait_for(test(*arguments, **more), 2 * DEADLINE))
-
-    return run
-
-
 @pytest.mark.parametrize(("flags", "always", "answered"), [(0, False, False), (STD, False, True), (0, True, True)])
-@run_async
 async def test_frame_with_torque_is_answered_as_usual_and_learnt(flags, always, answered):
     began = time.time()
     async with SessionClient(std=always) as client:
         client.current = fake_version(1, FakeModel(3.0), revision=4)
-        client.put(frame([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], 9, flags, tau=[7.0, 8.0]))
-        answer = await client.answer()
+        (answer,) = await client.answers(frame([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]], 9, flags, tau=[7.0, 8.0]))
         assert (answer.sequence, answer.revision, answer.tau.tolist()) == (9, 4, [3.0, 6.0])
         assert (answer.std.tolist() == [3.0, 3.0]) if answered else (answer.std is None)
         learnt = {"through": 9, "accepted": 1, "duplicates": 0, "rejected": {}, "revision": 7}
@@ -151,7 +139,6 @@ async def test_frame_with_torque_is_answered_as_usual_and_learnt(flags, always, 
         assert all(getattr(block, name).flags.writeable for name in ("q", "dq", "ddq", "tau", "mean", "std"))
 
 
-@run_async
 async def test_full_block_is_logged_at_once_the_rest_at_end():
     async with SessionClient(stream_flush_rows=3, stream_flush_s=NEVER) as client:
         await client.send_torques(1, 2, 3)
@@ -165,7 +152,6 @@ async def test_full_block_is_logged_at_once_the_rest_at_end():
     assert client.sent.empty()
 
 
-@run_async
 async def test_incomplete_block_is_logged_after_a_while():
     async with SessionClient(stream_flush_s=0.01) as client:
         for first in (1, 3):
@@ -175,29 +161,23 @@ async def test_incomplete_block_is_logged_after_a_while():
     assert np.concatenate(client.learners.sequences).tolist() == [1, 2, 3, 4]
 
 
-@run_async
 async def test_blocks_are_logged_in_order_and_a_full_backlog_stops_reading():
     async with SessionClient(stream_flush_rows=2, stream_flush_s=NEVER) as client:
         client.learners.open.clear()
-        client.put(*[frame(sequence=number, tau=TAU) for number in range(60)])
-        answered = [await client.answer() for _ in range(22)]
+        answered = await client.send_torques(*range(22))
+        client.put(*[frame(sequence=number, tau=TAU) for number in range(22, 60)])
         await client.run_pending()
         assert client.sent.empty()  # two are being logged, 20 wait, the others are not read
         client.learners.open.set()
-        texts = []
-        while len(answered) < 60 or len(texts) < 30:
-            message = await client.next()
-            if "bytes" in message:
-                answered.append(read(message["bytes"]))
-            else:
-                texts.append(json.loads(message["text"])["learnt"]["through"])
+        later = [await client.next() for _ in range(60 - 22 + 30)]
+        answered += [read(each["bytes"]) for each in later if "bytes" in each]
         assert [each.sequence for each in answered] == list(range(60))
+        texts = [json.loads(each["text"])["learnt"]["through"] for each in later if "text" in each]
         assert texts == list(range(1, 60, 2))
     assert client.learners.sequences == [[number, number + 1] for number in range(0, 60, 2)]
     assert client.learners.most_at_once == 1
 
 
-@run_async
 async def test_frames_of_one_revision_are_logged_together():
     async with SessionClient(stream_flush_s=NEVER) as client:
         first = client.current
@@ -209,7 +189,6 @@ async def test_frames_of_one_revision_are_logged_together():
     np.testing.assert_array_equal(blocks[1].mean, 2.0 * blocks[1].q)
 
 
-@run_async
 async def test_frames_received_together_get_increasing_times():
     async with SessionClient(stream_flush_rows=2, stream_flush_s=NEVER) as client:
         for first, later in ((1, -9.0), (3, 0.0), (5, 5.0)):
@@ -221,21 +200,20 @@ async def test_frames_received_together_get_increasing_times():
     np.testing.assert_allclose(steps, [0, 0, 0, 5, 0], atol=1e-3)
 
 
-@run_async
 async def test_nan_torque_is_answered_and_forwarded():
     async with SessionClient() as client:
-        client.put(frame(tau=[np.nan, np.inf]))
-        assert (await client.answer()).error is None
+        (answer,) = await client.answers(frame(tau=[np.nan, np.inf]))
+        assert answer.error is None
     np.testing.assert_array_equal(client.learners.blocks[0].tau, [[np.nan, np.inf]])
 
 
-@run_async
 async def test_torque_may_be_compared_or_learnt_or_both():
     async with SessionClient() as client:
-        client.put(frame(sequence=1, flags=ASK_EXTERNAL, tau=TAU, learn=False))  # nothing is learnt from this frame
-        client.put(frame(sequence=1, flags=ASK_EXTERNAL, tau=[np.nan, 1.0]))  # an error uses no sequence
-        client.put(frame(MOTION, 1, ASK_EXTERNAL, tau=TAU))
-        only, refused, both = [await client.answer() for _ in range(3)]
+        only, refused, both = await client.answers(
+            frame(flags=ASK_EXTERNAL, tau=TAU, learn=False),  # nothing is learnt from this frame
+            frame(flags=ASK_EXTERNAL, tau=[np.nan, 1.0]),  # an error uses no sequence
+            frame(flags=ASK_EXTERNAL, tau=TAU),
+        )
         assert await client.read_through() == 1
     assert refused.error["message"] == "tau[0] is nan, expected a finite number"
     assert (only.flags, both.flags) == (EXTERNAL, EXTERNAL)
@@ -245,14 +223,13 @@ async def test_torque_may_be_compared_or_learnt_or_both():
     np.testing.assert_array_equal([block.tau, block.mean, block.std], [[TAU], [MOTION[0]], [[1.0, 1.0]]])
 
 
-@run_async
 async def test_sequences_of_frames_with_torque_must_increase():
     async with SessionClient(stream_flush_s=NEVER) as client:
-        client.put(frame([[np.nan, 0]] * 3, 2**32 - 1, tau=TAU))  # an error uses no sequence
-        assert (await client.answer()).flags == ERROR
+        (failed,) = await client.answers(frame([[np.nan, 0]] * 3, 2**32 - 1, tau=TAU))  # an error uses no sequence
+        assert failed.flags == ERROR
         seen = await client.send_torques(3, 3, 2, 4)
-        client.put(frame(sequence=1))
-        assert (await client.answer()).error is None
+        (plain,) = await client.answers(frame(sequence=1))
+        assert plain.error is None
         assert [each.error is None for each in seen] == [True, False, False, True]
         assert seen[2].sequence == 2
         assert seen[2].error["message"] == (
@@ -261,7 +238,6 @@ async def test_sequences_of_frames_with_torque_must_increase():
     assert client.learners.sequences == [[3, 4]]
 
 
-@run_async
 async def test_block_that_cannot_be_logged_is_rejected_and_the_next_learnt(caplog):
     errors = ConflictError("learning is held"), invalid_request("tau", 1, "2"), ZeroDivisionError("odd")
     async with SessionClient(FakeLearners(*errors), stream_flush_rows=2, stream_flush_s=NEVER) as client:
@@ -278,7 +254,6 @@ async def test_block_that_cannot_be_logged_is_rejected_and_the_next_learnt(caplo
     assert "ZeroDivisionError" in caplog.text
 
 
-@run_async
 async def test_frames_lost_at_the_end_are_in_the_service_log(caplog):
     async with SessionClient(FakeLearners(ConflictError("learning is held")), stream_flush_s=NEVER) as client:
         await client.send_torques(6, 7)
@@ -286,20 +261,19 @@ async def test_frames_lost_at_the_end_are_in_the_service_log(caplog):
     assert "frames 6 to 7 of stream 'arm-1' were not learnt: learning is held" in caplog.text
 
 
-@run_async
 async def test_acknowledgement_waits_for_the_answer_being_written():
     async with SessionClient(stream_flush_rows=1) as client:
         client.passing["bytes"].clear()
         client.put(frame(sequence=1, tau=TAU))
-        while not client.session._texts:
-            await asyncio.sleep(0)
+        async with asyncio.timeout(DEADLINE):
+            while not client.session._texts:
+                await asyncio.sleep(0)
         assert client.sent.empty()
         client.passing["bytes"].set()
         assert "bytes" in await client.next()
         assert await client.read_through() == 1
 
 
-@run_async
 async def test_client_that_reads_no_acknowledgements_is_disconnected():
     with patch("service.api.stream.session.PATIENCE", ClientPatience(frame_s=0.01)):
         async with SessionClient(stream_flush_rows=1) as client:
@@ -310,7 +284,6 @@ async def test_client_that_reads_no_acknowledgements_is_disconnected():
             await asyncio.wait_for(client.aborted.wait(), DEADLINE)
 
 
-@run_async
 async def test_frames_of_a_disconnected_client_are_logged():
     async with SessionClient(stream_flush_rows=2, stream_flush_s=NEVER) as client:
         client.learners.open.clear()
@@ -331,7 +304,6 @@ async def test_frames_of_a_disconnected_client_are_logged():
         ({"pinned": True}, "flags is 3"),
     ],
 )
-@run_async
 async def test_read_only_streams_reject_torque(options, message):
     async with SessionClient(**options) as client:
         (refused,) = await client.send_torques(1)
