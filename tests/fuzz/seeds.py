@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, TENSORS
 from service.models.archive_reading import EXPORT, FORMAT, FORMAT_VERSION
 from tests.fuzz.targets import JOINTS
 from tests.service.datasets import bag_writers as bags
+from tests.service.datasets.reading import parquet, zipped
 from tests.service.models.archives.packing import pack, with_checksums
 
 ROWS = 24
@@ -59,18 +59,19 @@ def seeds() -> Iterator[tuple[str, bytes]]:
     flat = pa.table(COLUMNS)
     lists = pa.table({"t": T, "q": ARRAYS["q"].tolist(), "tau": ARRAYS["tau"].tolist(), "s": [{"a": 1.0}] * ROWS})
     for compression, entries, dictionary in (("none", flat, False), ("zstd", lists, True)):
-        yield "parquet", _parquet(entries, compression=compression, use_dictionary=dictionary)
+        options = {"compression": compression, "use_dictionary": dictionary, "store_schema": False}
+        yield "parquet", parquet(entries, **options)
     with tempfile.TemporaryDirectory() as given:
         folder = Path(given)
         written = bags.states(12, ("a", "b"))
         for compression in (None, "bz2"):
             yield "rosbag1", bags.write_rosbag1(folder / f"{compression}.bag", written, compression).read_bytes()
-        recorded = bags.write_rosbag2(folder / "two", written)
-        yield "rosbag2", bags.bare(recorded, folder / "two.db3").read_bytes()
-        yield "zip", bags.zipped(recorded, folder / "two.zip").read_bytes()
+        yield "rosbag2", bags.write_db3(folder / "two.db3", written).read_bytes()
+        yield "zip", bags.zipped(folder / "two", folder / "two.zip").read_bytes()
         for compression in ("NONE", "ZSTD"):
             yield "mcap", bags.write_mcap(folder / f"{compression}.mcap", written, compression).read_bytes()
-    yield "zip", _zip({"positions.txt": _text("q"), "velocities.txt": _text("dq"), "torques.txt": _text("tau")})
+    texts = {"positions.txt": _text("q"), "velocities.txt": _text("dq"), "torques.txt": _text("tau")}
+    yield "zip", zipped(texts, zipfile.ZIP_STORED)
     yield "zip", _lerobot()
     yield "urdf", URDF.format(LINK.format("base", 1) + LINK.format("l1", 2)).encode()
     yield from _models()
@@ -93,19 +94,6 @@ def _written(write: Any) -> bytes:
     return out.getvalue()
 
 
-def _parquet(table: pa.Table, **options: Any) -> bytes:
-    return _written(lambda file: pq.write_table(table, file, store_schema=False, **options))
-
-
-def _zip(files: dict[str, bytes]) -> bytes:
-    def write(file: io.BytesIO) -> None:
-        with zipfile.ZipFile(file, "w") as archive:
-            for name, content in files.items():
-                archive.writestr(name, content)
-
-    return _written(write)
-
-
 def _text(quantity: str) -> bytes:
     return _written(lambda file: np.savetxt(file, ARRAYS[quantity], "%.4f"))
 
@@ -122,7 +110,8 @@ def _lerobot() -> bytes:
     state = pa.array(ARRAYS["q"].tolist(), pa.list_(pa.float32()))
     rows = {"observation.state": state, "action": state, "timestamp": T, "episode_index": [0] * ROWS}
     names = {"meta/info.json": json.dumps(info).encode()}
-    return _zip({**names, "data/chunk-000/file-000.parquet": _parquet(pa.table(rows))})
+    data = {"data/chunk-000/file-000.parquet": parquet(rows, store_schema=False)}
+    return zipped(names | data, zipfile.ZIP_STORED)
 
 
 if __name__ == "__main__":

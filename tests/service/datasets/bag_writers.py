@@ -2,6 +2,7 @@
 
 import contextlib
 import shutil
+import sqlite3
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="bags are written by `ro
 ROS1 = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)
 ROS2 = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 JOINT_STATE = "sensor_msgs/msg/JointState"
+QUANTITIES = ("position", "velocity", "effort")
 START = 1_700_000_000_123_456_789
 SETTINGS = Settings()
 
@@ -52,11 +54,19 @@ def states(count: int, names: Sequence[str] = ("a", "b", "c"), seed: int = 0, st
     return [State(START + k * step, names, *row.tolist()) for k, row in enumerate(numbers)]
 
 
+def altered(written: list[State], rows: slice = slice(None), **values: Any) -> list[State]:
+    """Set fields of states in place; return all states."""
+    for each in written[rows]:
+        for name, value in values.items():
+            setattr(each, name, value)
+    return written
+
+
 def table_of(written: Iterable[State]) -> np.ndarray:
     """Return the expected table: s since the first stamp, positions, velocities, efforts."""
     written = list(written)
     times = [(each.stamp - written[0].stamp) / 1e9 for each in written]
-    return np.column_stack([times, *([getattr(s, key) for s in written] for key in ("position", "velocity", "effort"))])
+    return np.column_stack([times, *([getattr(s, key) for s in written] for key in QUANTITIES)])
 
 
 def message(store: Any, state: State) -> Any:
@@ -65,43 +75,54 @@ def message(store: Any, state: State) -> Any:
     stamp = types["builtin_interfaces/msg/Time"](sec=state.stamp // 10**9, nanosec=state.stamp % 10**9)
     extra = {"seq": 7} if store is ROS1 else {}
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id=state.frame, **extra)
-    numbers = {key: np.array(getattr(state, key), float) for key in ("position", "velocity", "effort")}
+    numbers = {key: np.array(getattr(state, key), float) for key in QUANTITIES}
     return types[JOINT_STATE](header=header, name=list(state.names), **numbers)
 
 
-def write_rosbag1(path: Path, written: Iterable[State], compression: str | None = None) -> Path:
-    """Write a ROS 1 bag with `rosbags`."""
-    writer = rosbag1.Writer(path)
-    if compression:
-        writer.set_compression(getattr(rosbag1.Writer.CompressionFormat, compression.upper()))
+def write_messages(writer: Any, store: Any, name: str, messages: Iterable[tuple[str, int, Any]]) -> None:
+    """Write messages of one type with a writer of `rosbags`: their topic, time of reception and object."""
+    serialize = store.serialize_ros1 if isinstance(writer, rosbag1.Writer) else store.serialize_cdr
     with writer:
         connections: dict[str, Any] = {}
-        for each in written:
-            if each.topic not in connections:
-                connections[each.topic] = writer.add_connection(each.topic, JOINT_STATE, typestore=ROS1)
-            data = ROS1.serialize_ros1(message(ROS1, each), JOINT_STATE)
-            writer.write(connections[each.topic], each.time, data)
+        for topic, time, each in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            writer.write(connections[topic], time, serialize(each, name))
+
+
+def write_states(writer: Any, store: Any, written: Iterable[State]) -> None:
+    """Write joint states with a writer of `rosbags`."""
+    write_messages(writer, store, JOINT_STATE, ((each.topic, each.time, message(store, each)) for each in written))
+
+
+def write_rosbag1(
+    path: Path, written: Iterable[State], compression: str | None = None, chunk_size: int = 1 << 20
+) -> Path:
+    """Write a ROS 1 bag with `rosbags`."""
+    writer = rosbag1.Writer(path)
+    writer.chunk_threshold = chunk_size
+    if compression:
+        writer.set_compression(getattr(rosbag1.Writer.CompressionFormat, compression.upper()))
+    write_states(writer, ROS1, written)
     return path
 
 
-def write_rosbag2(
-    folder: Path,
-    written: Iterable[State],
-    storage: str = "SQLITE3",
-    compression: str = "NONE",
-    big_endian: bool = False,
-) -> Path:
+def write_rosbag2(folder: Path, written: Iterable[State], storage: str = "SQLITE3", compression: str = "NONE") -> Path:
     """Write the folder of a ROS 2 bag with `rosbags`."""
     writer = rosbag2.Writer(folder, version=9, storage_plugin=getattr(rosbag2.StoragePlugin, storage))
     writer.set_compression(getattr(rosbag2.CompressionMode, compression), rosbag2.CompressionFormat.ZSTD)
-    with writer:
-        connections: dict[str, Any] = {}
-        for each in written:
-            if each.topic not in connections:
-                connections[each.topic] = writer.add_connection(each.topic, JOINT_STATE, typestore=ROS2)
-            data = ROS2.serialize_cdr(message(ROS2, each), JOINT_STATE, little_endian=not big_endian)
-            writer.write(connections[each.topic], each.time, data)
+    write_states(writer, ROS2, written)
     return folder
+
+
+def write_db3(path: Path, written: Iterable[State]) -> Path:
+    """Write a ROS 2 bag with `rosbags`, and copy its only data file to the path."""
+    return bare(write_rosbag2(path.with_suffix(""), written), path)
+
+
+def write_zip(path: Path, written: Iterable[State], *options: str) -> Path:
+    """Write a ROS 2 bag with `rosbags`, and zip its folder."""
+    return zipped(write_rosbag2(path.with_suffix(""), written, *options), path)
 
 
 def write_mcap(path: Path, written: Iterable[State], compression: str = "ZSTD", chunk_size: int = 4096) -> Path:
@@ -114,13 +135,8 @@ def write_mcap(path: Path, written: Iterable[State], compression: str = "ZSTD", 
         schema = writer.register_msgdef(JOINT_STATE, text)
         for each in written:
             stamp = {"sec": each.stamp // 10**9, "nanosec": each.stamp % 10**9}
-            body = {
-                "header": {"stamp": stamp, "frame_id": each.frame},
-                "name": list(each.names),
-                "position": list(each.position),
-                "velocity": list(each.velocity),
-                "effort": list(each.effort),
-            }
+            body = {"header": {"stamp": stamp, "frame_id": each.frame}, "name": list(each.names)}
+            body |= {key: list(getattr(each, key)) for key in QUANTITIES}
             writer.write_message(each.topic, schema, body, log_time=each.time, publish_time=each.time)
         writer.finish()
     return path
@@ -145,6 +161,12 @@ def read(path: Path, kind: BagKind, options: ReadOptions | None = None, settings
     """Read the whole table of a bag."""
     with open_bag(path, kind, options or ReadOptions(), settings) as table:
         return read_blocks(table)
+
+
+def run_script(path: Path, script: str) -> None:
+    """Change the database of a ROS 2 bag."""
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.executescript(script)
 
 
 @contextlib.contextmanager

@@ -1,16 +1,36 @@
-"""Reading uploads in tests."""
+"""Writing and reading uploads in tests."""
 
+import io
+import zipfile
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from service.datasets.formats.opening import open_table
 from service.datasets.formats.table import BLOCK_ROWS
 from service.datasets.options import ReadOptions
-from service.foundation.errors import ServiceError
+from service.foundation.errors import InvalidDataError, ServiceError
 from service.foundation.settings import Settings
+
+
+def zipped(files, compression=zipfile.ZIP_DEFLATED):
+    """Return a zip archive of contents by name."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", compression) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return out.getvalue()
+
+
+def parquet(table, **options):
+    """Return a Parquet file of a table, or of columns by name."""
+    out = io.BytesIO()
+    pq.write_table(table if isinstance(table, pa.Table) else pa.table(table), out, **options)
+    return out.getvalue()
 
 
 @dataclass
@@ -70,3 +90,11 @@ def read_rejected(folder, body, kind, options=None, error=ServiceError, **settin
     assert set(folder.iterdir()) <= before | {folder / "upload"}, "leftovers"
     detail = caught.value.detail
     return (detail[0].field, detail[0].value, detail[0].expected) if detail else caught.value.message
+
+
+def check_rejected(folder, body, kind, field, words="", options=None, error=InvalidDataError, **settings):
+    """Check the field of a rejection; and a text in its detail, or its value and expected as a tuple."""
+    reply = read_rejected(folder, body, kind, options, error, **settings)
+    assert reply[0] == field
+    assert words in " ".join(reply) if isinstance(words, str) else reply[1 : 1 + len(words)] == words
+    return reply

@@ -1,5 +1,6 @@
 """Recordings with known properties, staged as uploads are, and a robot to compare them with."""
 
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -61,11 +62,11 @@ def report_on(
     recipe: Recipe | None = None,
     **options: Any,
 ) -> DatasetReport:
-    recipe = recipe or Recipe()
+    """The report of columns, made in a new folder."""
+    folder, recipe = Path(tempfile.mkdtemp(dir=folder)), recipe or Recipe()
     raw = staged(folder, names, columns)
     prepared = prepare(raw, folder, recipe, 30, raw.disk)
-    made = make_report(raw, prepared, profile, ["read"], recipe, **options)
-    return DatasetReport.model_validate(made)
+    return DatasetReport.model_validate(make_report(raw, prepared, profile, ["read"], recipe, **options))
 
 
 @dataclass(frozen=True)

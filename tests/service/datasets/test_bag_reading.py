@@ -9,60 +9,42 @@ from service.datasets.formats.bags import reading
 from service.datasets.formats.bags.reading import open_bag
 from service.datasets.options import ReadOptions
 from service.foundation.settings import Settings
-from tests.service.datasets.bag_writers import (
-    START,
-    bare,
-    read,
-    states,
-    table_of,
-    write_mcap,
-    write_rosbag1,
-    write_rosbag2,
-    zipped,
-)
+from tests.service.datasets import bag_writers as bags
+from tests.service.datasets.bag_writers import START, altered, read, states, table_of, write_mcap
 
-NAMES = ("t", *(f"{joint}/{quantity}" for quantity in ("position", "velocity", "effort") for joint in "abc"))
-
-
-@pytest.mark.parametrize("compression", [None, "bz2", "lz4"])
-def test_rosbag1_is_read_back(tmp_path, compression):
-    written = states(300)
-    result = read(write_rosbag1(tmp_path / "a.bag", written, compression), "rosbag1")
-    assert result.names == NAMES
-    assert result.joint_names == ("a", "b", "c")
-    np.testing.assert_array_equal(result.rows, table_of(written))
+NAMES = ("t", *(f"{joint}/{quantity}" for quantity in bags.QUANTITIES for joint in "abc"))
 
 
 @pytest.mark.parametrize(
-    ("storage", "compression"),
-    [("SQLITE3", "NONE"), ("SQLITE3", "FILE"), ("SQLITE3", "MESSAGE"), ("MCAP", "FILE"), ("MCAP", "STORAGE")],
+    ("kind", "write", "options"),
+    [
+        *(("rosbag1", bags.write_rosbag1, [compression]) for compression in (None, "bz2", "lz4")),
+        *(("rosbag2", bags.write_zip, ["SQLITE3", compression]) for compression in ("NONE", "FILE", "MESSAGE")),
+        *(("rosbag2", bags.write_zip, ["MCAP", compression]) for compression in ("FILE", "STORAGE")),
+        *(("mcap", write_mcap, [compression]) for compression in ("NONE", "LZ4", "ZSTD")),
+    ],
 )
-def test_zipped_rosbag2_is_read_back(tmp_path, storage, compression):
-    written = states(300)
-    folder = write_rosbag2(tmp_path / "bag", written, storage, compression)
-    result = read(zipped(folder, tmp_path / "a.zip"), "rosbag2")
-    assert result.names == NAMES
-    np.testing.assert_array_equal(result.rows, table_of(written))
-    assert {each.name for each in tmp_path.iterdir()} == {"bag", "a.zip"}  # nothing is left behind
-
-
-@pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
-def test_mcap_of_another_writer_is_read_back(tmp_path, compression):
+def test_bag_is_read_back(tmp_path, kind, write, options):
     """Texts have every length, which a reader that caches layouts could confuse."""
-    written = states(300, ("joint_1", "joint_22"))
+    written = states(300)
     for number, each in enumerate(written):
         each.frame = "x" * (number * 7 % 91)
-    result = read(write_mcap(tmp_path / "a.mcap", written, compression), "mcap")
+    path = write(tmp_path / "a.bag", written, *options)
+    before = set(tmp_path.iterdir())
+    result = read(path, kind)
+    assert result.names == NAMES
+    assert result.joint_names == ("a", "b", "c")
     np.testing.assert_array_equal(result.rows, table_of(written))
+    assert set(tmp_path.iterdir()) == before
 
 
 def test_files_of_a_split_recording_are_joined_in_their_order(tmp_path):
     written = states(30)
     (tmp_path / "whole").mkdir()
     for part, number in enumerate((1, 2, 10)):
-        folder = write_rosbag2(tmp_path / f"part{number}", written[part * 10 : part * 10 + 10])
-        bare(folder, tmp_path / "whole" / f"run_{number}.db3")
-    result = read(zipped(tmp_path / "whole", tmp_path / "a.zip"), "rosbag2")
+        folder = bags.write_rosbag2(tmp_path / f"part{number}", written[part * 10 : part * 10 + 10])
+        bags.bare(folder, tmp_path / "whole" / f"run_{number}.db3")
+    result = read(bags.zipped(tmp_path / "whole", tmp_path / "a.zip"), "rosbag2")
     np.testing.assert_array_equal(result.rows, table_of(written))
 
 
@@ -70,26 +52,19 @@ def test_times_are_header_stamps_or_reception_times(tmp_path):
     written = states(20)
     for number, each in enumerate(written):
         each.received = START + number * 11_000_000
-    result = read(write_mcap(tmp_path / "a.mcap", written), "mcap")
-    np.testing.assert_array_equal(result["t"], np.arange(20) / 100)
-    assert "times are header stamps, counted from 1700000000.123456789 s" in result.facts
-
-    written[7].stamp = written[3].stamp
-    back = read(write_mcap(tmp_path / "b.mcap", written), "mcap")
-    np.testing.assert_array_equal(back["t"], np.arange(20) * 11_000_000 / 1e9)
-    assert any("header stamps go back 1 time, first in row 8" in fact for fact in back.facts)
-
-    for each in written:
-        each.stamp = 0
-    unset = read(write_mcap(tmp_path / "c.mcap", written), "mcap")
-    np.testing.assert_array_equal(unset["t"], back["t"])
-    assert any("20 of 20 header stamps are not set" in fact for fact in unset.facts)
+    stamped, received = np.arange(20) / 100, np.arange(20) * 11_000_000 / 1e9
+    for rows, stamp, times, fact in (
+        (slice(0), 0, stamped, "times are header stamps, counted from 1700000000.123456789 s"),
+        (slice(7, 8), written[3].stamp, received, "header stamps go back 1 time, first in row 8"),
+        (slice(20), 0, received, "20 of 20 header stamps are not set"),
+    ):
+        result = read(write_mcap(tmp_path / "a.mcap", altered(written, rows, stamp=stamp)), "mcap")
+        np.testing.assert_array_equal(result["t"], times)
+        assert any(fact in each for each in result.facts)
 
 
 def test_missing_quantities_have_no_columns(tmp_path):
-    written = states(20)
-    for each in written:
-        each.velocity = ()
+    written = altered(states(20), velocity=())
     written[4].effort = ()
     result = read(write_mcap(tmp_path / "a.mcap", written), "mcap")
     assert result.names == tuple(name for name in NAMES if "velocity" not in name)

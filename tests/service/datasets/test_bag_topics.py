@@ -1,6 +1,5 @@
 """The choice of the topic, and the message types: joint states, Franka states and controller states."""
 
-import sqlite3
 from typing import Any
 
 import numpy as np
@@ -8,21 +7,8 @@ import pytest
 
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, InvalidRequestError
-from tests.service.datasets.bag_writers import (
-    ROS1,
-    ROS2,
-    START,
-    bare,
-    read,
-    rosbag1,
-    rosbag2,
-    states,
-    table_of,
-    typesys,
-    write_mcap,
-    write_rosbag1,
-    write_rosbag2,
-)
+from tests.service.datasets import bag_writers as bags
+from tests.service.datasets.bag_writers import ROS1, ROS2, START, altered, read, states, table_of, typesys
 
 JOINTS = tuple(f"fr3_joint{joint}" for joint in range(1, 8))
 FRANKA_STATE = """std_msgs/Header header
@@ -40,6 +26,7 @@ franka_msgs/Errors current_errors
 MSG: franka_msgs/Errors
 bool joint_reflex
 """
+ROS2_FRANKA_STATE = FRANKA_STATE.replace("tau_J", "tau_j")
 FRANKA_ROBOT_STATE = """std_msgs/Header header
 CollisionIndicators collision_indicators
 sensor_msgs/JointState measured_joint_state
@@ -70,29 +57,24 @@ def store_with(name: str, text: str, base: Any) -> Any:
     return store
 
 
-def write(path, name: str, messages: list[Any], store: Any, ros1: bool):
+def write(path, name: str, messages: list[Any], store: Any, ros1: bool = False):
     """Write messages on the topic /state at 1 kHz."""
+    timed = [("/state", START + number * 10**6, each) for number, each in enumerate(messages)]
     if ros1:
-        with rosbag1.Writer(path) as writer:
-            connection = writer.add_connection("/state", name, typestore=store)
-            for number, each in enumerate(messages):
-                writer.write(connection, START + number * 10**6, store.serialize_ros1(each, name))
+        bags.write_messages(bags.rosbag1.Writer(path), store, name, timed)
         return path
-    with rosbag2.Writer(path.with_suffix(""), version=9) as writer:
-        connection = writer.add_connection("/state", name, typestore=store)
-        for number, each in enumerate(messages):
-            writer.write(connection, START + number * 10**6, store.serialize_cdr(each, name))
-    return bare(path.with_suffix(""), path)
+    bags.write_messages(bags.rosbag2.Writer(path.with_suffix(""), version=9), store, name, timed)
+    return bags.bare(path.with_suffix(""), path)
 
 
-def filled(store: Any, name: str, **given: Any) -> Any:
-    """Return a message; fields that are not given are zero."""
+def filled(store: Any, name: str, given: dict[str, Any]) -> Any:
+    """Return a message, with messages within as dictionaries; fields that are not given are zero."""
     values = {}
     for field, (node, what) in store.fielddefs[name][1]:
-        if field in given:
+        if node == typesys.store.Nodetype.NAME:
+            values[field] = filled(store, what, given.get(field, {}))
+        elif field in given:
             values[field] = given[field]
-        elif node == typesys.store.Nodetype.NAME:
-            values[field] = filled(store, what)
         elif node == typesys.store.Nodetype.BASE:
             values[field] = {"string": "", "bool": False}.get(what[0], 0)
         else:
@@ -103,101 +85,81 @@ def filled(store: Any, name: str, **given: Any) -> Any:
 
 def forget_definitions(path):
     """Remove the message definitions, which ROS 2 Humble does not record."""
-    with sqlite3.connect(path) as database:
-        database.execute("DROP TABLE message_definitions")
-    database.close()
+    bags.run_script(path, "DROP TABLE message_definitions")
 
 
-def stamp(store: Any, number: int) -> Any:
-    """Return a header whose stamp is `number` ms after the start."""
-    time = START + number * 10**6
-    return filled(
-        store,
-        "std_msgs/msg/Header",
-        stamp=store.types["builtin_interfaces/msg/Time"](sec=time // 10**9, nanosec=time % 10**9),
-        frame_id="base",
-    )
+def franka_state(torque):
+    """Return the fields of a Franka state, whose torque differs in name."""
+    return lambda q, dq, tau: {"q": q, "dq": dq, "q_d": q + 9, torque: tau}
 
 
-def check_forty(tmp_path, name, text, base, fields, with_definition=True, options=None):
-    """Write and read 40 states of 7 joints. fields: (store, positions, velocities, efforts) → fields."""
+def robot_state(*numbers):
+    """Return the fields of a Franka robot state."""
+    sets = {"measured_joint_state": numbers, "desired_joint_state": np.array(numbers) + 5}
+    fields = {key: dict(zip(bags.QUANTITIES, each, strict=True)) for key, each in sets.items()}
+    return {key: {"name": list(JOINTS), **each} for key, each in fields.items()}
+
+
+def controller_state(*numbers):
+    """Return the fields of the state of a controller."""
+    points = {"desired": np.array(numbers) + 3, "actual": numbers}
+    fields = {key: dict(zip(("positions", "velocities", "effort"), each, strict=True)) for key, each in points.items()}
+    return {"joint_names": list(JOINTS), **fields}
+
+
+NUMBERED = tuple(f"joint{joint}" for joint in range(1, 8))
+ROBOT_STATE = ("franka_msgs/msg/FrankaRobotState", FRANKA_ROBOT_STATE, ROS2, robot_state)
+CONTROLLER_STATE = ("control_msgs/msg/JointTrajectoryControllerState", CONTROLLER, ROS1, controller_state)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "base", "fields", "with_definition", "joints"),
+    [
+        ("franka_msgs/msg/FrankaState", FRANKA_STATE, ROS1, franka_state("tau_J"), True, NUMBERED),
+        ("franka_msgs/msg/FrankaState", ROS2_FRANKA_STATE, ROS2, franka_state("tau_j"), True, NUMBERED),
+        (*ROBOT_STATE, True, JOINTS),
+        (*ROBOT_STATE, False, JOINTS),  # as ROS 2 Humble records it: the known start of the message is read
+        (*CONTROLLER_STATE, True, JOINTS),
+    ],
+    ids=["Franka, ROS 1", "Franka, ROS 2", "Franka robot", "Franka robot without definition", "controller"],
+)
+def test_state_of_another_type_is_read(tmp_path, name, text, base, fields, with_definition, joints):
     store, numbers = store_with(name, text, base), np.random.default_rng(0).normal(size=(40, 3, 7))
-    messages = [
-        filled(store, name, header=stamp(store, number), **fields(store, *each)) for number, each in enumerate(numbers)
-    ]
+    messages = []
+    for number, each in enumerate(numbers):
+        stamp = dict(zip(("sec", "nanosec"), divmod(START + number * 10**6, 10**9), strict=True))
+        messages.append(filled(store, name, {"header": {"stamp": stamp, "frame_id": "base"}, **fields(*each)}))
     path = write(tmp_path / "upload.x", name, messages, store, base is ROS1)
     if not with_definition:
         forget_definitions(path)
-    result = read(path, "rosbag1" if base is ROS1 else "rosbag2", options)
-    np.testing.assert_array_equal(result.rows[:, 1:], numbers.reshape(40, -1))
-    np.testing.assert_array_equal(result["t"], np.arange(40) / 1000)
-    return result
+    for names in (None, JOINTS):
+        result = read(path, "rosbag1" if base is ROS1 else "rosbag2", ReadOptions(joint_names=names))
+        np.testing.assert_array_equal(result.rows[:, 1:], numbers.reshape(40, -1))
+        np.testing.assert_array_equal(result["t"], np.arange(40) / 1000)
+        assert result.joint_names == (names or joints)
+        unit = result.units.get(f"{result.joint_names[2]}/effort")
+        assert unit == ("N·m" if "franka" in name else None)
 
 
-@pytest.mark.parametrize(("base", "torque"), [(ROS1, "tau_J"), (ROS2, "tau_j")])
-def test_franka_state(tmp_path, base, torque):
-    def fields(store, q, dq, tau):
-        return {"q": q, "dq": dq, "q_d": q + 9, torque: tau}
-
-    state = "franka_msgs/msg/FrankaState", FRANKA_STATE.replace("tau_J", torque), base, fields
-    result = check_forty(tmp_path, *state)
-    assert result.joint_names == tuple(f"joint{joint}" for joint in range(1, 8))
-    assert result.units["joint3/effort"] == "N·m"
-    (tmp_path / "named").mkdir()
-    assert check_forty(tmp_path / "named", *state, options=ReadOptions(joint_names=JOINTS)).joint_names == JOINTS
-
-
-@pytest.mark.parametrize("with_definition", [True, False])
-def test_franka_robot_state(tmp_path, with_definition):
-    """Without its definition, as ROS 2 Humble records it, the known start of the message is read."""
-
-    def fields(store, *numbers):
-        def state(q, dq, tau):
-            kind = store.types["sensor_msgs/msg/JointState"]
-            header = filled(store, "std_msgs/msg/Header")
-            return kind(header=header, name=list(JOINTS), position=q, velocity=dq, effort=tau)
-
-        return {"measured_joint_state": state(*numbers), "desired_joint_state": state(*(np.array(numbers) + 5))}
-
-    name = "franka_msgs/msg/FrankaRobotState"
-    assert check_forty(tmp_path, name, FRANKA_ROBOT_STATE, ROS2, fields, with_definition).joint_names == JOINTS
-
-
-def test_state_of_a_controller(tmp_path):
-    def fields(store, *numbers):
-        def point(q, dq, tau):
-            kind = "trajectory_msgs/msg/JointTrajectoryPoint"
-            return filled(store, kind, positions=q, velocities=dq, effort=tau)
-
-        points = {"desired": point(*(np.array(numbers) + 3)), "actual": point(*numbers)}
-        return {"joint_names": list(JOINTS), **points}
-
-    name = "control_msgs/msg/JointTrajectoryControllerState"
-    assert check_forty(tmp_path, name, CONTROLLER, ROS1, fields).joint_names == JOINTS
-
-
-def test_several_topics_need_a_choice(tmp_path):
-    written = states(30)
-    for each in written[::3]:
-        each.topic = "/desired"
-    for path, kind in (
-        (write_mcap(tmp_path / "a.mcap", written), "mcap"),
-        (write_rosbag1(tmp_path / "a.bag", written), "rosbag1"),
-        (bare(write_rosbag2(tmp_path / "bag", written), tmp_path / "a.db3"), "rosbag2"),
-    ):
-        with pytest.raises(InvalidDataError, match="Set `topic`, because the bag has several") as error:
-            read(path, kind)
-        assert "/desired (sensor_msgs/JointState, 10 messages)" in str(error.value)
-        assert "/joint_states (sensor_msgs/JointState, 20 messages)" in str(error.value)
-        with pytest.raises(InvalidRequestError, match=r"topic is /other, expected one of .*/desired"):
-            read(path, kind, ReadOptions(topic="/other"))
-        result = read(path, kind, ReadOptions(topic="/joint_states"))
-        np.testing.assert_array_equal(result.rows, table_of(each for each in written if each.topic == "/joint_states"))
+@pytest.mark.parametrize(
+    ("kind", "write"), [("mcap", bags.write_mcap), ("rosbag1", bags.write_rosbag1), ("rosbag2", bags.write_db3)]
+)
+def test_several_topics_need_a_choice(tmp_path, kind, write):
+    written = altered(states(30), slice(None, None, 3), topic="/desired")
+    path = write(tmp_path / "upload.x", written)
+    with pytest.raises(InvalidDataError, match="Set `topic`, because the bag has several") as error:
+        read(path, kind)
+    assert "/desired (sensor_msgs/JointState, 10 messages)" in str(error.value)
+    assert "/joint_states (sensor_msgs/JointState, 20 messages)" in str(error.value)
+    with pytest.raises(InvalidRequestError, match=r"topic is /other, expected one of .*/desired"):
+        read(path, kind, ReadOptions(topic="/other"))
+    result = read(path, kind, ReadOptions(topic="/joint_states"))
+    np.testing.assert_array_equal(result.rows, table_of(each for each in written if each.topic == "/joint_states"))
 
 
 def test_bag_without_joint_states_is_rejected_with_its_topics(tmp_path):
     name = "std_msgs/msg/String"
-    path = write(tmp_path / "upload.x", name, [ROS2.types[name](data="hello")] * 3, ROS2, ros1=False)
+    path = write(tmp_path / "upload.x", name, [ROS2.types[name](data="hello")] * 3, ROS2)
     with pytest.raises(InvalidDataError, match=r"/state \(std_msgs/String, 3 messages\), expected a topic of type"):
         read(path, "rosbag2")
     with pytest.raises(InvalidRequestError, match=r"topic is /state of type std_msgs/String \(cdr\)"):
@@ -206,8 +168,8 @@ def test_bag_without_joint_states_is_rejected_with_its_topics(tmp_path):
 
 def test_type_without_its_definition_is_rejected(tmp_path):
     name = "franka_msgs/msg/FrankaState"
-    store = store_with(name, FRANKA_STATE.replace("tau_J", "tau_j"), ROS2)
-    path = write(tmp_path / "upload.x", name, [filled(store, name)], store, ros1=False)
+    store = store_with(name, ROS2_FRANKA_STATE, ROS2)
+    path = write(tmp_path / "upload.x", name, [filled(store, name, {})], store)
     forget_definitions(path)
     with pytest.raises(InvalidDataError, match="of type franka_msgs/FrankaState, whose definition is not in the bag"):
         read(path, "rosbag2")

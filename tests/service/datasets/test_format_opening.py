@@ -16,32 +16,28 @@ from service.datasets.staging import prepare, staging
 from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
+from tests.service.data import npz
 from tests.service.datasets.mapping_tables import options
-from tests.service.datasets.reading import read, read_rejected
-from tests.service.datasets.test_format_lerobot import dataset, zipped
+from tests.service.datasets.reading import check_rejected, parquet, read, read_rejected, zipped
+from tests.service.datasets.test_format_lerobot import LAST, dataset
 
 RNG = np.random.default_rng(8)
 FRAME = pd.DataFrame({"t": np.arange(50) / 100, "q1": RNG.normal(size=50), "tau1": RNG.normal(size=50)})
 
 
-def bodies():
-    parquet, npz = io.BytesIO(), io.BytesIO()
-    FRAME.to_parquet(parquet)
-    np.savez(npz, t=FRAME.t, q=FRAME[["q1"]].to_numpy(), tau=FRAME[["tau1"]].to_numpy())
-    return {
-        "csv": FRAME.to_csv(index=False).encode(),
-        "parquet": parquet.getvalue(),
-        "npz": npz.getvalue(),
-        "json_lines": FRAME.to_json(orient="records", lines=True, double_precision=15).encode(),
-        "json": FRAME.to_json(double_precision=15).encode(),
-    }
-
-
-BODIES = bodies()
+BODIES = {
+    "csv": FRAME.to_csv(index=False).encode(),
+    "parquet": FRAME.to_parquet(),
+    "npz": npz(t=FRAME.t, q=FRAME[["q1"]].to_numpy(), tau=FRAME[["tau1"]].to_numpy()),
+    "json_lines": FRAME.to_json(orient="records", lines=True, double_precision=15).encode(),
+    "json": FRAME.to_json(double_precision=15).encode(),
+    "lerobot": zipped(dataset()),
+}
+TABLES = [kind for kind in BODIES if kind != "lerobot"]
 
 
 @pytest.mark.each_once
-@pytest.mark.parametrize("actual", BODIES)
+@pytest.mark.parametrize("actual", TABLES)
 @pytest.mark.parametrize("reply", [*KINDS, None])
 def test_file_is_read_by_its_content(tmp_path, actual, reply):
     result = read(tmp_path, BODIES[actual], reply)
@@ -75,8 +71,7 @@ def tar():
     ids=["HDF5", "MATLAB", "pickle", "gzip", "UTF-16", "image", "empty"],
 )
 def test_unsupported_format_is_named_with_the_declared_one(tmp_path, reply, body, name):
-    field, value, expected = read_rejected(tmp_path, body, reply, error=InvalidDataError)
-    assert field == "file"
+    _, value, expected = check_rejected(tmp_path, body, reply, "file")
     assert name in value
     assert reply not in KINDS or KINDS[reply] in value + expected
 
@@ -111,20 +106,17 @@ def damaged(body, rng):
 
 def damaged_member(body, rng):
     """Return an archive with one damaged member but correct checksums."""
-    out = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(body)) as source, zipfile.ZipFile(out, "w") as target:
-        names = source.namelist()
-        chosen = names[rng.integers(len(names))]
-        for name in names:
-            target.writestr(name, damaged(source.read(name), rng) if name == chosen else source.read(name))
-    return out.getvalue()
+    with zipfile.ZipFile(io.BytesIO(body)) as source:
+        members = {name: source.read(name) for name in source.namelist()}
+    chosen = list(members)[rng.integers(len(members))]
+    return zipped(members | {chosen: damaged(members[chosen], rng)}, zipfile.ZIP_STORED)
 
 
-@pytest.mark.parametrize("kind", [*BODIES, "lerobot"])
+@pytest.mark.parametrize("kind", BODIES)
 def test_damaged_files_are_read_or_rejected(tmp_path, kind):
     """Recordings that can be read are also prepared, and all results are finite."""
     rng, limits = np.random.default_rng(6), Settings(home=tmp_path)
-    body = zipped(dataset()) if kind == "lerobot" else BODIES[kind]
+    body = BODIES[kind]
     path, outcomes = tmp_path / "upload", {"read": 0, "rejected": 0}
     for number in range(40 if kind == "lerobot" else 100):
         inside = kind in ("npz", "lerobot") and number % 3
@@ -146,3 +138,24 @@ def test_damaged_files_are_read_or_rejected(tmp_path, kind):
 def test_file_of_comment_marks_is_rejected(tmp_path, body):
     """Found by fuzzing."""
     read_rejected(tmp_path, body.encode(), "csv")
+
+
+PAGES = parquet({"t": np.zeros(200_000)}, compression="zstd", use_dictionary=False)
+BOMB = zipped(dataset(**{LAST: bytes(3_000_000)}))
+TEXTS = zipped({f"{name}.txt": "0.5 0.25 0.125\n" * 90 for name in ("positions", "torques")})
+
+
+@pytest.mark.parametrize(
+    ("kind", "body", "limit", "message"),
+    [
+        ("lerobot", BOMB, 100_000, "at most 100000"),
+        ("parquet", PAGES, 1_000_000, "at most 1000000"),
+        ("zip", TEXTS, 2000, "unpacks to"),
+        ("json", b"[" + b'{"t": 0.5},' * 100 + b"{}]", 10**6, "NDJSON"),
+    ],
+)
+def test_unpacked_size_is_limited(tmp_path, monkeypatch, kind, body, limit, message):
+    monkeypatch.setattr("service.datasets.formats.json.MAX_BYTES", 1000)
+    assert len(body) < 50_000
+    assert Settings().max_unpacked_bytes > limit
+    assert message in read_rejected(tmp_path, body, kind, error=TooLargeError, max_unpacked_bytes=limit)

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lipcore.profiles import profile
 from service.datasets.mapping.mapping import map_columns
 from service.datasets.mapping.recognition import find_times, interpret_name
 from service.foundation.errors import InvalidDataError, InvalidRequestError
@@ -50,19 +51,6 @@ def test_numbered_joints_are_found_in_order(patterns, of):
     assert all(each.factor == 1.0 for row in result.quantities.values() for each in row)
 
 
-def test_currents_beside_desired_torque_need_a_choice():
-    """Neither is measured torque, so neither may be used without an option."""
-    names = numbered("q#", "i#", "tau_des#")
-    with pytest.raises(InvalidDataError) as caught:
-        mapped(names)
-    assert "torque_constants is missing, expected 3 numbers in N·m/A" in str(caught.value)
-    assert 'or columns={"tau": "tau_des{joint}"} to learn commanded torque' in str(caught.value)
-    result = mapped(names, options(torque_constants=(0.1, 0.2, 0.3)))
-    assert read_as(result)["tau"] == ["i1", "i2", "i3"]
-    chosen = mapped(names, options(columns={"tau": "tau_des{joint}"}))
-    assert read_as(chosen)["tau"] == ["tau_des1", "tau_des2", "tau_des3"]
-
-
 def test_desired_torque_alone_gives_a_warning():
     result = mapped(numbered("q#", "tau_des#"))
     (warned,) = [note for note in result.notes if note.startswith("warning: ")]
@@ -72,16 +60,7 @@ def test_desired_torque_alone_gives_a_warning():
     assert not any(note.startswith("warning: ") for note in meant.notes)
 
 
-def test_measured_torque_is_preferred_and_others_are_reported():
-    result = mapped(numbered("q#", "tau_des#", "tau_meas#", "i#"))
-    assert read_as(result)["tau"] == ["tau_meas1", "tau_meas2", "tau_meas3"]
-    assert any("tau could also be read from tau_des{joint}, i{joint}" in note for note in result.notes)
-
-
-@pytest.mark.parametrize(
-    "pattern",
-    ["{}/position", "position_{}", "position[{}]", "observation.state.{}.pos"],
-)
+@pytest.mark.parametrize("pattern", ["{}/position", "position_{}", "position[{}]", "observation.state.{}.pos"])
 @pytest.mark.parametrize("joints", [("shoulder_pan", "elbow", "wrist"), ("panda_joint1", "panda_joint2")])
 def test_named_joints_keep_their_names_and_the_order_of_the_file(pattern, joints):
     names = [pattern.format(each) for each in joints]
@@ -91,16 +70,6 @@ def test_named_joints_keep_their_names_and_the_order_of_the_file(pattern, joints
     assert read_as(result) == {"q": names, "tau": tau[::-1]}
 
 
-def test_joints_are_ordered_by_the_number_in_their_names():
-    order = ("fr3_joint10", "fr3_joint2", "fr3_joint1")
-    result = mapped([f"{joint}/{what}" for joint in order for what in ("position", "effort")])
-    assert result.joints == order[::-1]
-    joints = ("elbow", "shoulder_lift", "shoulder_pan")
-    alphabet = mapped([f"{joint}/{what}" for joint in joints for what in ("position", "effort")])
-    assert any("alphabetical order" in note for note in alphabet.notes)
-    assert any("in the order fr3_joint1, fr3_joint2, fr3_joint10" in note for note in result.notes)
-
-
 UR_QUANTITIES = ("target_q", "target_qd", "target_qdd", "target_moment", "actual_q", "actual_qd", "actual_current")
 RTDE = [
     *("timestamp", "actual_momentum", "actual_main_voltage", "actual_robot_current", "speed_scaling", "robot_mode"),
@@ -108,66 +77,113 @@ RTDE = [
     *(f"actual_TCP_pose_{axis}" for axis in range(6)),
     *(f"{quantity}_{axis}" for quantity in ("elbow_position", "elbow_velocity") for axis in range(3)),
 ]
-FRANKA = ("q", "q_d", "dq", "dq_d", "ddq_d", "tau_J", "tau_J_d", "dtau_J", "tau_ext_hat_filtered", "theta", "dtheta")
+LIBFRANKA = ("q", "q_d", "dq", "dq_d", "ddq_d", "tau_J", "tau_J_d", "dtau_J", "tau_ext_hat_filtered", "theta", "dtheta")
+FRANKA = [f"{quantity}[{joint}]" for quantity in LIBFRANKA for joint in range(7)]
+PLAIN = numbered("q#", "tau#")
+TORQUES = numbered("q#", "i#", "tau_des#")
+SIDES = numbered("left_q#", "right_q#", "left_tau#", "right_tau#")
+WORDY_JOINTS = ("shoulder", "elbow")
+WORDY = ["t", "arm shoulder p", "arm elbow p", "arm elbow f", "arm shoulder f"]
+ARM = Arm(("base", "shoulder", "elbow"), "current", (1.0, 2.0, 3.0))
+COMMANDED_ARM = Arm(("joint1",), "commanded")
+
+
+def named(*joints):
+    """Return names of positions and efforts."""
+    return [f"{joint}/{what}" for joint in joints for what in ("position", "effort")]
+
+
+def case(names, given=None, note="", robot=None, names_in_file=None, of=(1, 2, 3), columns=None, **expected):
+    """Return a case of names: the patterns of the columns that are read, and other properties of the mapping."""
+    if columns is not None:
+        patterns = zip(("q", "tau", "dq"), columns, strict=False)
+        expected["columns"] = {name: [pattern.replace("#", str(joint)) for joint in of] for name, pattern in patterns}
+    return names, given or {}, note, robot, names_in_file, expected
+
+
+CHOSEN_SIDE = {"columns": {"q": "right_q{joint}", "tau": "right_tau{joint}"}}
+SPACED = {"columns": {"q": "arm {joint} p", "tau": "arm {joint} f"}}
+ZEIT = ["zeit", "x1", "x2", "y2", "y1"]
+LISTED = {"columns": {"t": "zeit", "q": ("x1", "x2"), "tau": ("y1", "y2")}}
+RTDE_COLUMNS = ("actual_q_#", "actual_current_#", "actual_qd_#")
+RTDE_UNUSED = tuple(each for each in RTDE if not each.startswith(("timestamp", "actual_q", "actual_current_")))
+FER = named(*(f"fer_joint{joint}" for joint in (3, 1, 2, 4, 5, 6, 7)))
+FER_COLUMNS = ("fer_joint#/position", "fer_joint#/effort")
+PANDA = profile("panda")
+ONE = ["q1", "tau1"]
+MEASURED, CURRENT = ({"effort": effort, "convention": "gravity_included"} for effort in ("measured", "current"))
+COMMANDED = {"effort": "commanded", "convention": "gravity_compensated"}
+ORDERED = ("fr3_joint1", "fr3_joint2", "fr3_joint10")
+OTHER_TORQUES = "tau could also be read from tau_des{joint}, i{joint}"
+BESIDE_GRIPPER = named("elbow", "base", "gripper", "shoulder")
 
 
 @pytest.mark.parametrize(
-    ("names", "firsts"),
+    ("names", "given", "note", "robot", "names_in_file", "expected"),
     [
-        ([f"{each}[{j}]" for each in FRANKA for j in range(7)], {"q": "q[0]", "dq": "dq[0]", "tau": "tau_J[0]"}),
-        (numbered("q#", "actual_q#", "tau#", "measured_tau#", "effort#"), {"q": "q1", "tau": "tau1"}),
-        (["time", "position", "velocity", "effort"], {"q": "position", "dq": "velocity", "tau": "effort"}),
+        # measured torque first, unless options choose
+        case(FRANKA, of=range(7), columns=("q[#]", "tau_J[#]", "dq[#]")),
+        case(numbered("q#", "actual_q#", "tau#", "measured_tau#", "effort#"), columns=("q#", "tau#")),
+        case(["time", "position", "velocity", "effort"], of="1", columns=("position", "effort", "velocity")),
+        case(numbered("q#", "tau_des#", "tau_meas#", "i#"), note=OTHER_TORQUES, columns=("q#", "tau_meas#")),
+        case(TORQUES, {"torque_constants": (0.1, 0.2, 0.3)}, columns=("q#", "i#")),
+        case(TORQUES, {"columns": {"tau": "tau_des{joint}"}}, columns=("q#", "tau_des#")),
+        case(RTDE, {"torque_constants": (0.1,) * 6}, "target_q_{joint}", of=range(6), columns=RTDE_COLUMNS, **CURRENT),
+        case(RTDE, {"torque_constants": (0.1,) * 6}, t="timestamp", unused=RTDE_UNUSED),
+        case(RTDE, {"effort": "commanded"}, of=range(6), columns=("actual_q_#", "target_moment_#", "actual_qd_#")),
+        case(RTDE, {"effort": "commanded"}, convention="gravity_compensated"),
+        # effort and convention
+        case(ONE, **MEASURED),
+        case(ONE, {"effort": "commanded"}, **COMMANDED),
+        case(ONE, {"torque_convention": "gravity_compensated"}, **COMMANDED),
+        case(ONE, robot=COMMANDED_ARM, **COMMANDED),
+        case(ONE, {"effort": "measured"}, robot=COMMANDED_ARM, **MEASURED),
+        case(
+            ONE,
+            {"torque_convention": "gravity_included"},
+            robot=COMMANDED_ARM,
+            effort="commanded",
+            convention="gravity_included",
+        ),
+        case(ONE, {"units": {"tau": "A"}, "torque_constants": (2.0,)}, **CURRENT),
+        # columns by option
+        case(SIDES, CHOSEN_SIDE, columns=("right_q#", "right_tau#")),
+        case(ZEIT, LISTED, of=(1, 2), columns=("x#", "y#"), t="zeit", joints=("joint1", "joint2")),
+        case(WORDY, SPACED, of=WORDY_JOINTS, columns=("arm # p", "arm # f"), joints=WORDY_JOINTS),
+        # joints
+        case(named(*ORDERED[::-1]), note="in the order fr3_joint1, fr3_joint2, fr3_joint10", joints=ORDERED),
+        case(named("elbow", "shoulder_lift", "shoulder_pan"), note="alphabetical order"),
+        case(PLAIN, {"joints": ("joint3", "joint1")}, of=(3, 1), columns=("q#", "tau#"), dropped=["joint2"]),
+        case(PLAIN, {"joints": ("joint3", "joint1")}, joints=("joint3", "joint1")),
+        case(PLAIN, names_in_file=("a", "b", "c"), joints=("a", "b", "c")),
+        case(PLAIN, {"joint_names": ("x", "y", "z")}, names_in_file=("a", "b", "c"), joints=("x", "y", "z")),
+        case(PLAIN, {"joint_names": ("x", "y"), "drop_joints": ("joint2",)}, joints=("x", "y")),
+        # a robot orders its joints, excludes others, and knows the effort; a column named torque is not a current
+        case(BESIDE_GRIPPER, note="gripper", robot=ARM, joints=ARM.joint_names, dropped=["gripper"], effort="current"),
+        case(BESIDE_GRIPPER, robot=ARM, scales=[1.0, 2.0, 3.0]),
+        case(FER, robot=PANDA, of=range(1, 8), columns=FER_COLUMNS, joints=PANDA.joint_names),
+        case(PLAIN, robot=ARM, joints=ARM.joint_names, effort="measured"),
+        case(named(*ARM.joint_names), {"drop_joints": ("shoulder",)}, robot=ARM, joints=("base", "elbow")),
+        case(named(*ARM.joint_names), {"drop_joints": ("shoulder",)}, robot=ARM, constants=(1.0, 3.0)),
+        case(named("a", "b", "c"), {"joint_names": ARM.joint_names}, robot=ARM, joints=ARM.joint_names),
     ],
-    ids=["libfranka", "documented names win", "one joint"],
 )
-def test_measured_columns_are_preferred(names, firsts):
-    assert {quantity: row[0] for quantity, row in read_as(mapped(names)).items()} == firsts
-
-
-def test_columns_of_a_universal_robot_are_mapped():
-    result = mapped(RTDE, options(torque_constants=(0.1,) * 6))
-    assert read_as(result) == {
-        "q": [f"actual_q_{joint}" for joint in range(6)],
-        "dq": [f"actual_qd_{joint}" for joint in range(6)],
-        "tau": [f"actual_current_{joint}" for joint in range(6)],
+def test_columns_are_mapped(names, given, note, robot, names_in_file, expected):
+    result = mapped(names, options(**given), robot, joint_names=names_in_file)
+    found = {
+        "columns": read_as(result),
+        "joints": result.joints,
+        "dropped": list(result.dropped),
+        "scales": [each.factor for each in result.quantities["tau"]],
+        "t": result.t[0].name if result.t else None,
+        "unused": result.unused,
+        **vars(result.torque),
     }
-    assert (result.torque.effort, result.torque.convention) == ("current", "gravity_included")
-    assert result.t[0].name == "timestamp"
-    assert "speed_scaling" in result.unused
-    assert any("target_q_{joint}" in note for note in result.notes)
+    assert {name: found[name] for name in expected} == expected
+    assert any(note in each for each in ["", *result.notes])
 
 
-def test_effort_chooses_among_several_torques():
-    result = mapped(RTDE, options(effort="commanded"))
-    assert read_as(result)["tau"] == [f"target_moment_{joint}" for joint in range(6)]
-    assert result.torque.convention == "gravity_compensated"
-
-
-def test_ambiguous_columns_are_listed_with_the_option():
-    names = numbered("left_q#", "right_q#", "left_tau#", "right_tau#")
-    with pytest.raises(InvalidDataError) as caught:
-        mapped(names)
-    assert "left_q{joint}, right_q{joint}" in caught.value.message
-    assert 'columns={"q": "left_q{joint}"}' in caught.value.message
-    result = mapped(names, options(columns={"q": "right_q{joint}", "tau": "right_tau{joint}"}))
-    assert read_as(result) == {
-        "q": ["right_q1", "right_q2", "right_q3"],
-        "tau": ["right_tau1", "right_tau2", "right_tau3"],
-    }
-
-
-def test_columns_can_be_given_by_list_or_pattern():
-    result = mapped(["zeit", "a", "b", "c", "d"], options(columns={"t": "zeit", "q": ("a", "b"), "tau": ("d", "c")}))
-    assert read_as(result) == {"q": ["a", "b"], "tau": ["d", "c"]}
-    assert (result.t[0].name, result.joints) == ("zeit", ("joint1", "joint2"))
-    names = ["t", "arm shoulder p", "arm elbow p", "arm elbow f", "arm shoulder f"]
-    result = mapped(names, options(columns={"q": "arm {joint} p", "tau": "arm {joint} f"}))
-    assert result.joints == ("shoulder", "elbow")
-    assert read_as(result)["tau"] == ["arm shoulder f", "arm elbow f"]
-
-
-NAMED = [f"{joint}/{quantity}" for joint in ("a", "b", "c") for quantity in ("position", "effort")]
-REFUSED = [
+UNUSABLE = [
     (["t", "a", "b"], {}, "positions q1..qn"),
     (numbered("q#"), {}, "column tau1 is missing"),
     (["t", "q1", "q2", "tau1"], {}, "column tau2 is missing, expected tau1..tau2 because"),
@@ -186,108 +202,50 @@ REFUSED = [
     (["q1", "tau1"], {"columns": {"q": "q1", "tau": "q1"}}, "for several quantities"),
     (["q1", "tau1"], {"drop_joints": ("b",)}, "drop_joints is b, expected one of the joints of the file: joint1"),
     (["q1", "tau1"], {"joint_names": ("a", "b")}, "2 names, expected 1 names, one per joint"),
-    (numbered("q#", "tau#"), {"joint_names": ("a", "b", "a")}, "expected a different name for each joint"),
+    (PLAIN, {"joint_names": ("a", "b", "a")}, "expected a different name for each joint"),
     (["q1", "tau1"], {"drop_joints": ("joint1",)}, "joints is 0, expected 1 to 32"),
     (numbered("q#", "tau#", of=range(1, 34)), {}, "joints is 33, expected 1 to 32"),
     (numbered("q#", "current_#"), {}, "torque_constants is missing, expected 3 numbers"),
     (["q1", "effort1 [A]"], {"effort": "measured"}, "expected the effort that the name or unit of effort"),
+    # neither currents nor desired torque are measured torque, so neither may be used without an option
+    (TORQUES, {}, "torque_constants is missing, expected 3 numbers in N·m/A"),
+    (TORQUES, {}, 'or columns={"tau": "tau_des{joint}"} to learn commanded torque'),
+    (SIDES, {}, "left_q{joint}, right_q{joint}"),
+    (SIDES, {}, 'columns={"q": "left_q{joint}"}'),
+]
+WRONG_OPTIONS = [
+    ({"units": {"q": "furlong"}}, "units.q is furlong, expected rad, mrad, deg"),
+    ({"units": {"speed": "rad"}}, "units.speed is not one of t, q"),
+    ({"columns": {"x": "q1"}}, "columns.x is not a quantity"),
+    ({"columns": {"q": "{joint}{joint}"}}, "{joint} only once"),
+    ({"joints": ("joint1", "joint1")}, "each joint only once"),
+    ({"effort": "current", "torque_constants": (1.0,)}, "Expected 3 torque constants, one per kept joint, got 1."),
+    ({"effort": "current", "torque_constants": (1.0, 0.0, 1.0)}, "none of them 0"),
+    (
+        {"torque_constants": (1.0, 2.5, 3.0)},
+        "expected no `torque_constants` because tau{joint} is assumed to be measured torque, gravity included",
+    ),
+    ({"effort": "commanded", "torque_constants": (1.0,) * 3}, "Set effort=current if it is motor current"),
+    ({"torque_factors": (1.0,)}, "Expected 3 torque factors, one per kept joint, got 1."),
 ]
 
 
-@pytest.mark.parametrize(("names", "given", "message"), REFUSED)
-def test_unusable_columns_are_rejected_by_name(names, given, message):
-    with pytest.raises(InvalidDataError) as caught:
+@pytest.mark.parametrize(
+    ("names", "given", "message", "error"),
+    [
+        *((*each, InvalidDataError) for each in UNUSABLE),
+        *((PLAIN, *each, InvalidRequestError) for each in WRONG_OPTIONS),
+    ],
+)
+def test_unusable_columns_and_wrong_options_are_rejected_by_name(names, given, message, error):
+    with pytest.raises(error) as caught:
         mapped(names, options(**given))
     assert message in caught.value.message
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"units": {"q": "furlong"}}, "units.q is furlong, expected rad, mrad, deg"),
-        ({"units": {"speed": "rad"}}, "units.speed is not one of t, q"),
-        ({"columns": {"x": "q1"}}, "columns.x is not a quantity"),
-        ({"columns": {"q": "{joint}{joint}"}}, "{joint} only once"),
-        ({"joints": ("joint1", "joint1")}, "each joint only once"),
-        ({"effort": "current", "torque_constants": (1.0,)}, "Expected 3 torque constants, one per kept joint, got 1."),
-        ({"effort": "current", "torque_constants": (1.0, 0.0, 1.0)}, "none of them 0"),
-        (
-            {"torque_constants": (1.0, 2.5, 3.0)},
-            "expected no `torque_constants` because tau{joint} is assumed to be measured torque, gravity included",
-        ),
-        ({"effort": "commanded", "torque_constants": (1.0,) * 3}, "Set effort=current if it is motor current"),
-        ({"torque_factors": (1.0,)}, "Expected 3 torque factors, one per kept joint, got 1."),
-    ],
-)
-def test_wrong_options_are_rejected(given, message):
-    with pytest.raises(InvalidRequestError) as caught:
-        mapped(numbered("q#", "tau#"), options(**given))
-    assert message in caught.value.message
-
-
-def test_joints_are_kept_in_the_given_order():
-    result = mapped(numbered("q#", "tau#"), options(joints=("joint3", "joint1")))
-    assert result.joints == ("joint3", "joint1")
-    assert read_as(result) == {"q": ["q3", "q1"], "tau": ["tau3", "tau1"]}
-    assert list(result.dropped) == ["joint2"]
-
-
-def test_joint_names_come_from_the_file_or_the_upload():
-    names = numbered("q#", "tau#")
-    assert mapped(names, joint_names=("a", "b", "c")).joints == ("a", "b", "c")
-    assert mapped(names, options(joint_names=("x", "y", "z")), joint_names=("a", "b", "c")).joints == ("x", "y", "z")
-    dropped = options(joint_names=("x", "y"), drop_joints=("joint2",))
-    assert mapped(names, dropped).joints == ("x", "y")
-
-
-ARM = Arm(("base", "shoulder", "elbow"), "current", (1.0, 2.0, 3.0))
-
-
-def test_robot_orders_its_joints_and_excludes_others():
-    joints = ("elbow", "base", "gripper", "shoulder")
-    names = [f"{joint}/{what}" for joint in joints for what in ("position", "effort")]
-    result = mapped(names, robot=ARM)
-    assert result.joints == ARM.joint_names
-    assert list(result.dropped) == ["gripper"]
-    assert [each.factor for each in result.quantities["tau"]] == [1.0, 2.0, 3.0]
-    assert result.torque.effort == "current"
-    assert any("gripper" in note for note in result.notes)
-
-
-def test_robot_names_numbered_joints():
-    result = mapped(numbered("q#", "tau#"), robot=ARM)
-    assert result.joints == ARM.joint_names
-    assert result.torque.effort == "measured"  # a column named torque is not a current
-
-
-def test_joint_of_a_robot_can_be_excluded_with_its_constant():
-    names = [f"{joint}/{what}" for joint in ARM.joint_names for what in ("position", "effort")]
-    result = mapped(names, options(drop_joints=("shoulder",)), ARM)
-    assert result.joints == ("base", "elbow")
-    assert result.torque.constants == (1.0, 3.0)
-
-
 def test_joints_of_another_robot_are_rejected():
     with pytest.raises(InvalidDataError, match="the joints of arm: base, shoulder, elbow"):
-        mapped(NAMED, robot=ARM)
-    assert mapped(NAMED, options(joint_names=ARM.joint_names), ARM).joints == ARM.joint_names
-
-
-@pytest.mark.parametrize(
-    ("given", "robot", "effort", "convention"),
-    [
-        ({}, None, "measured", "gravity_included"),
-        ({"effort": "commanded"}, None, "commanded", "gravity_compensated"),
-        ({"torque_convention": "gravity_compensated"}, None, "commanded", "gravity_compensated"),
-        ({}, Arm(("joint1",), "commanded"), "commanded", "gravity_compensated"),
-        ({"effort": "measured"}, Arm(("joint1",), "commanded"), "measured", "gravity_included"),
-        ({"torque_convention": "gravity_included"}, Arm(("joint1",), "commanded"), "commanded", "gravity_included"),
-        ({"units": {"tau": "A"}, "torque_constants": (2.0,)}, None, "current", "gravity_included"),
-    ],
-)
-def test_effort_and_convention(given, robot, effort, convention):
-    torque = mapped(["q1", "tau1"], options(**given), robot).torque
-    assert (torque.effort, torque.convention) == (effort, convention)
+        mapped(named("a", "b", "c"), robot=ARM)
 
 
 @pytest.mark.parametrize(

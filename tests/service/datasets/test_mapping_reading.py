@@ -1,5 +1,6 @@
 """Tables become columns on disk in SI units; wrong values are rejected with their row, missing ones are counted."""
 
+import sqlite3
 import tracemalloc
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lipcore.profiles import profile
+from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.mapping.vocabulary import unit_factor
 from service.datasets.staging import staging
@@ -14,6 +17,7 @@ from service.foundation.errors import InvalidDataError, StorageFullError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
 from tests.service.datasets.mapping_tables import RATE, Arm, canonical, motion, options, table
+from tests.service.training.test_real_data import PANDA, SCHUNK
 
 
 @pytest.fixture
@@ -33,15 +37,17 @@ def reading(tmp_path, limits):
     return once
 
 
-def stage_rejected(reading, columns, *args, **kwargs):
+def check_rejected(reading, columns, message, field=None):
+    """Check the message of a rejection, and the field if one is given."""
     with pytest.raises(InvalidDataError) as caught:
-        reading(columns, *args, **kwargs)
-    return caught.value
+        reading(columns)
+    assert message in caught.value.message
+    assert field in (None, caught.value.detail[0].field)
 
 
-def changed(name, row, value, **kwargs):
+def changed(name, row, value):
     """Return canonical columns with one value changed; rows are counted from 1."""
-    columns = canonical(motion(**kwargs))
+    columns = canonical(motion())
     columns[name] = columns[name].copy()
     columns[name][row - 1] = value
     return columns
@@ -52,9 +58,8 @@ def test_columns_are_staged_as_they_were_recorded(reading):
     result = reading(canonical(data) | {"episode": np.repeat([4.0, 2.0], 100)})
     assert result.staged.quantities == ("q", "dq", "ddq", "tau")
     assert result.staged.joint_names == ("joint1", "joint2")
-    for name in ("q", "dq", "ddq", "tau"):
-        np.testing.assert_array_equal(result.staged.table(name), data[name])
-    np.testing.assert_array_equal(result.staged.read("t"), data["t"])
+    for name, values in data.items():
+        np.testing.assert_array_equal(result.staged.read("t") if name == "t" else result.staged.table(name), values)
     np.testing.assert_array_equal(result.staged.read("episode"), np.repeat([4.0, 2.0], 100))
     assert (result.facts["effort"], result.torque_convention) == ("measured", "gravity_included")
     assert not result.staged.missing().any()
@@ -80,8 +85,7 @@ def test_blocks_of_any_size_give_the_same(tmp_path_factory, block):
 
 
 @pytest.mark.parametrize(
-    ("quantity", "unit"),
-    [("q", "deg"), ("dq", "rpm"), ("ddq", "deg/s^2"), ("tau", "mN·m"), ("t", "ms")],
+    ("quantity", "unit"), [("q", "deg"), ("dq", "rpm"), ("ddq", "deg/s^2"), ("tau", "mN·m"), ("t", "ms")]
 )
 @pytest.mark.parametrize("where", ["header", "file", "upload"])
 def test_units_are_converted_from_any_source(reading, quantity, unit, where):
@@ -131,15 +135,6 @@ def test_currents_become_torques(reading):
     np.testing.assert_array_equal(reading(columns, robot=arm).staged.table("tau"), data["tau"] * [3.0, 4.0])
 
 
-def test_too_many_missing_rows_are_rejected_with_the_worst_column(reading):
-    columns = canonical(motion())
-    columns["tau2"][50:] = np.nan
-    columns["q1"][0] = np.nan
-    reply = stage_rejected(reading, columns)
-    assert reply.detail[0].field == "tau2, row 51"
-    assert "150 of 200 rows" in reply.message
-
-
 def test_velocities_without_values_are_ignored(reading):
     columns = canonical(motion())
     columns["dq1"][:] = columns["dq2"][:] = np.nan
@@ -154,10 +149,24 @@ def with_column(**columns):
     return {**canonical(motion()), **columns}
 
 
+def scaled(**factors):
+    """Return canonical columns with quantities in other units."""
+    return canonical({name: each * factors.get(name, 1.0) for name, each in motion(rows=1000).items()})
+
+
+def without(first, last):
+    """Return 200 values, of which some are missing."""
+    values = np.cos(np.arange(200.0))
+    values[first:last] = np.nan
+    return values
+
+
+MISSING = with_column(tau2=without(50, 200), q1=without(0, 1))
 BACK = "expected more than 0.38, the time of the row before"
 LOCKED = "constant at 0.25, expected a joint that moves. Leave out locked joints with drop_joints=joint2"
 DEGREES = 'radians or metres within ±12.6. Set units={"q": "deg"} if these are degrees'
 UNMEASURED = "constant at 0, expected a torque measured while the joint moved. Leave out a joint without one"
+TOO_FEW = "The file has 29 usable rows, expected at least 30"
 NO_TIME = "199 repeat the time of the row before"
 
 
@@ -168,9 +177,7 @@ NO_TIME = "199 repeat the time of the row before"
         pytest.param(changed("t", 65, 0.2), "t, row 65", "the time of the row before", id="back at a block's start"),
         pytest.param(changed("tau2", 4, 1e300), "tau2, row 4", "SI units within ±1e+12", id="absurdly large"),
         pytest.param(changed("q2", 12, 90.0), "q2, row 12", DEGREES, id="degrees"),
-        pytest.param(
-            canonical(motion(rows=29)), "rows", "The file has 29 usable rows, expected at least 30", id="too few"
-        ),
+        pytest.param(canonical(motion(rows=29)), "rows", TOO_FEW, id="too few"),
         pytest.param(with_column(t=np.full(200, 3.0)), "rows", NO_TIME, id="no time"),
         pytest.param(with_column(episode=np.full(200, 0.5)), "episode, row 1", "a whole number", id="half"),
         pytest.param(with_column(q2=np.full(200, 0.25)), "q2", LOCKED, id="locked"),
@@ -178,12 +185,14 @@ NO_TIME = "199 repeat the time of the row before"
         pytest.param(with_column(tau1=np.full(200, -3.5)), "tau1", "constant at -3.5, expected", id="constant torque"),
         pytest.param(with_column(t=np.arange(200) * 10.0), "t", 'units={"t": "ms"}', id="milliseconds"),
         pytest.param(with_column(t=1.7e18 + np.arange(200) * 1e7), "t, row 1", 'units={"t": "ns"}', id="ns since 1970"),
+        pytest.param(MISSING, "tau2, row 51", "150 of 200 rows", id="missing"),
+        pytest.param(scaled(dq=180 / np.pi), None, '{"dq": "deg/s"}', id="deg/s"),
+        pytest.param(scaled(q=10, dq=10, ddq=1800 / np.pi), None, '{"ddq": "deg/s^2"}', id="deg/s^2"),
+        pytest.param(scaled(q=18 / np.pi, dq=0.1, ddq=0.1), None, '{"q": "deg"}', id="deg"),
     ],
 )
 def test_unusable_values_are_rejected_with_their_row(reading, columns, field, message):
-    reply = stage_rejected(reading, columns)
-    assert reply.detail[0].field == field
-    assert message in reply.message
+    check_rejected(reading, columns, message, field)
 
 
 def wrapped(q, lowest=-np.pi):
@@ -216,7 +225,7 @@ def test_unwrapping_restarts_with_every_episode(reading):
 def test_positions_with_a_unit_have_no_limit(reading):
     data = motion()
     data["q"][:, 0] += 30.0
-    assert 'units={"q": "rad"} if the joint turns this far' in stage_rejected(reading, canonical(data)).message
+    check_rejected(reading, canonical(data), 'units={"q": "rad"} if the joint turns this far')
     np.testing.assert_array_equal(reading(canonical(data), options(units={"q": "rad"})).staged.table("q"), data["q"])
 
 
@@ -224,20 +233,6 @@ def test_full_disk_stops_reading(tmp_path):
     limits = Settings(home=tmp_path, min_free_bytes=2**60)
     with pytest.raises(StorageFullError):
         read(table(canonical(motion())), tmp_path, options(), None, limits, Disk(limits))
-
-
-@pytest.mark.parametrize(
-    ("scale", "hint"),
-    [
-        ({"dq": 180 / np.pi}, '{"dq": "deg/s"}'),
-        ({"q": 10, "dq": 10, "ddq": 180 / np.pi * 10}, '{"ddq": "deg/s^2"}'),
-        ({"q": 180 / np.pi / 10, "dq": 0.1, "ddq": 0.1}, '{"q": "deg"}'),
-    ],
-)
-def test_derivatives_in_other_units_are_recognised(reading, scale, hint):
-    data = motion(rows=1000)
-    reply = stage_rejected(reading, canonical({name: each * scale.get(name, 1.0) for name, each in data.items()}))
-    assert hint in reply.message
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -251,16 +246,13 @@ def test_noisy_and_late_derivatives_are_accepted(reading, seed):
 
 @pytest.mark.parametrize(
     ("moves", "record"),
-    [
-        (0.5, "warning: gripper is left out although it moved by 0.5"),
-        (1e-5, "gripper is left out and did not move"),
-    ],
+    [(0.5, "warning: gripper is left out although it moved by 0.5"), (1e-5, "gripper is left out and did not move")],
 )
 def test_dropped_joint_is_reported(reading, moves, record):
     data = motion()
-    positions = {f"{joint}/position": each for joint, each in zip(("joint1", "joint2"), data["q"].T, strict=True)}
-    columns = {"gripper/position": np.linspace(0, moves, 200), **canonical(data), **positions}
-    del columns["q1"], columns["q2"]
+    renamed = {"q1": "joint1/position", "q2": "joint2/position"}
+    columns = {renamed.get(name, name): values for name, values in canonical(data).items()}
+    columns["gripper/position"] = np.linspace(0, moves, 200)
     result = reading(columns, options(drop_joints=("gripper",)))
     assert any(record in note for note in result.noted)
     assert result.facts["dropped_joints"] == ["gripper"]
@@ -289,3 +281,36 @@ def test_memory_does_not_grow_with_the_recording(tmp_path, limits):
         tracemalloc.stop()
     assert result.staged.rows == rows
     assert peak < 10e6
+
+
+def read_file(tmp_path, path, kind, robot=None):
+    """Read a real recording."""
+    limits = Settings(home=tmp_path)
+    with open_table(path, kind, options().read, limits) as given:
+        return read(given, tmp_path, options(), robot, limits, Disk(limits))
+
+
+@pytest.mark.skipif(not PANDA.exists(), reason=f"{PANDA} is not there")
+def test_recording_of_a_real_panda_is_mapped(tmp_path):
+    rosbags = pytest.importorskip("rosbags.typesys")
+    store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
+    with sqlite3.connect(f"file:{PANDA}?mode=ro", uri=True) as database:
+        rows = database.execute("SELECT data FROM messages ORDER BY timestamp").fetchall()
+    database.close()
+    messages = [store.deserialize_cdr(data, "sensor_msgs/msg/JointState") for (data,) in rows]
+    result = read_file(tmp_path, PANDA, "rosbag2", profile("panda"))
+    assert result.staged.joint_names == profile("panda").joint_names
+    assert (result.facts["effort"], result.torque_convention) == ("measured", "gravity_included")
+    for quantity, field in (("q", "position"), ("dq", "velocity"), ("tau", "effort")):
+        expected = np.array([getattr(message, field) for message in messages])
+        np.testing.assert_array_equal(result.staged.table(quantity), expected)
+
+
+@pytest.mark.skipif(not SCHUNK.exists(), reason=f"{SCHUNK} is not there")
+def test_episodes_of_a_real_schunk_are_mapped(tmp_path):
+    result = read_file(tmp_path, SCHUNK, "npz")
+    assert result.noted == []
+    with np.load(SCHUNK) as file:
+        for quantity in ("q", "dq", "tau"):
+            np.testing.assert_array_equal(result.staged.table(quantity), file[quantity])
+        np.testing.assert_array_equal(result.staged.read("episode"), file["episode"])

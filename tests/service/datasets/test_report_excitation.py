@@ -8,7 +8,6 @@ import pytest
 
 from lipcore.preparation.recipe import Recipe
 from lipcore.robots.library import load_robot
-from service.contract.datasets import DatasetReport
 from service.datasets.report.excitation import collinearity, count_reversals
 from tests.service.datasets.report_data import profile_of, report_on, swing
 
@@ -34,24 +33,16 @@ def regressor(name: str, columns: dict[str, np.ndarray]) -> np.ndarray:
     return np.array([pinocchio.computeJointTorqueRegressor(model, data, *row).copy() for row in rows])
 
 
-@pytest.fixture
-def judged(tmp_path: Path) -> tuple[dict[str, np.ndarray], DatasetReport]:
+def test_friction_beside_rigid_bodies_is_that_of_least_squares(tmp_path: Path) -> None:
     columns = exact("double-pendulum", 30.0, 1)
     columns["tau"] = columns["tau"] + NOISE * np.random.default_rng(3).standard_normal((1500, 2))
     profile = profile_of("double-pendulum")
-    return columns, report_on(tmp_path, profile.joint_names, columns, profile, AS_IT_IS)
-
-
-def test_friction_beside_rigid_bodies_is_that_of_least_squares(
-    judged: tuple[dict[str, np.ndarray], DatasetReport],
-) -> None:
-    columns, report = judged
+    report = report_on(tmp_path, profile.joint_names, columns, profile, AS_IT_IS)
     dq = columns["dq"]
     friction = np.zeros((len(dq), 2, 6))
     for joint in (0, 1):
-        friction[:, joint, 3 * joint : 3 * joint + 3] = np.column_stack(
-            [dq[:, joint], np.tanh(dq[:, joint] / 0.02), np.ones(len(dq))]
-        )
+        terms = [dq[:, joint], np.tanh(dq[:, joint] / 0.02), np.ones(len(dq))]
+        friction[:, joint, 3 * joint : 3 * joint + 3] = np.column_stack(terms)
     both = np.concatenate([regressor("double-pendulum", columns), friction], axis=2) / NOISE[:, None]
     solved = np.linalg.pinv(both.reshape(2 * len(dq), -1), rcond=1e-10)
     stds = np.sqrt(np.square(solved).sum(axis=1))[-6:].reshape(2, 3)

@@ -23,26 +23,22 @@ def test_report_describes_the_samples(tmp_path: Path) -> None:
     made = make_report(raw, prepared, profile, ["a fact"])
     report = DatasetReport.model_validate(made)
     assert json.loads(json.dumps(made, allow_nan=False)) == made
-    tau = low_pass(columns["tau"], 128.0)[32:-32]
+    q, tau = (low_pass(columns[name], 128.0)[32:-32] for name in ("q", "tau"))
     assert (report.rows_uploaded, report.rows, report.episodes, report.gaps) == (2560, 2496, 1, 0)
-    assert report.derived == ["ddq"]
-    assert report.rate_hz == 128
+    assert (report.derived, report.rate_hz, report.reading) == (["ddq"], 128, ["a fact"])
     assert report.ranges["tau"]["max"] == pytest.approx(tau.max(0).tolist(), rel=1e-9)
-    assert report.ranges["q"]["min"] == pytest.approx(low_pass(columns["q"], 128.0)[32:-32].min(0).tolist(), rel=1e-9)
+    assert report.ranges["q"]["min"] == pytest.approx(q.min(0).tolist(), rel=1e-9)
     assert report.torque_noise_estimate == pytest.approx(noise_level([tau]).tolist(), rel=1e-6)
+    assert (report.steps, report.recipe) == (prepared.steps, Recipe().to_json())
     assert report.preparation == [step["text"] for step in prepared.steps]
-    assert report.steps == prepared.steps
-    assert report.recipe == Recipe().to_json()
-    assert report.reading == ["a fact"]
     assert [each.torque for each in report.noise] == pytest.approx([0.01, 0.01], rel=0.15)
     assert report.limits[0].torque_used == pytest.approx(np.abs(columns["tau"][:, 0]).max() / 50)
     assert "The recording lasts 20 s. Record several minutes" in report.advice[-1]
 
 
 def test_constant_torque_and_unknown_robot_get_a_report(tmp_path: Path) -> None:
-    columns = dict(recording("double-pendulum", 20.0, 100.0, 6))
-    columns["tau"] = columns["tau"].copy()
-    columns["tau"][:, 1] = 2.0
+    columns = recording("double-pendulum", 20.0, 100.0, 6)
+    columns = columns | {"tau": np.column_stack([columns["tau"][:, 0], np.full(2000, 2.0)])}
     report = report_on(tmp_path, ("a", "b"), columns, profile_of("finger-edu"), Recipe(filtering="never"))
     assert any("no joint matches robot finger-edu" in each for each in report.reading)
     assert report.robot is None

@@ -10,7 +10,7 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 
 from lipcore.data.signals import noise_level
 from lipcore.preparation.recipe import Recipe
-from service.contract.datasets import DatasetReport, Lag, Timing
+from service.contract.datasets import Lag, Timing
 from service.datasets.report.advice import collect_warnings
 from service.datasets.report.fit import Fit
 from service.datasets.report.lag import shifts
@@ -34,12 +34,8 @@ AS_IT_IS = Recipe(filtering="never")
 
 
 def robot(**changed: np.ndarray) -> FakeProfile:
-    limits = {
-        "lower": np.array([-1.0, -1.0]),
-        "upper": np.array([1.0, 1.0]),
-        "speed": np.array([2.0, np.inf]),
-        "torque": np.array([np.nan, 5.0]),
-    }
+    limits = {"lower": np.array([-1.0, -1.0]), "upper": np.array([1.0, 1.0])}
+    limits |= {"speed": np.array([2.0, np.inf]), "torque": np.array([np.nan, 5.0])}
     return FakeProfile("arm", PENDULUM, ("revolute", "revolute"), **limits | changed)
 
 
@@ -49,9 +45,7 @@ def test_jitter_is_a_share_of_the_usual_step(tmp_path: Path) -> None:
     t = np.concatenate([[5.0], 5.0 + np.cumsum(steps)])
     timing = analyse_times(staged(tmp_path, ("a",), {"t": t, "q": t[:, None]}), 1.5, 3).timing
     assert timing.rate_hz == pytest.approx(100)
-    assert timing.jitter_p50 == pytest.approx(0, abs=1e-9)
-    assert timing.jitter_p99 == pytest.approx(0.2)
-    assert timing.jitter_max == pytest.approx(0.2)
+    assert (timing.jitter_p50, timing.jitter_p99, timing.jitter_max) == pytest.approx((0, 0.2, 0.2), abs=1e-9)
     assert timing.duration_s == pytest.approx(t[-1] - t[0])
     assert (timing.gaps, timing.repeated_stamps, timing.missing_rows) == ([], 3, 0)
 
@@ -78,12 +72,9 @@ def test_limits_are_compared_joint_by_joint() -> None:
     q = np.linspace(-0.5, 1.5, 201)
     columns = {"q": q, "dq": 3 * q, "tau": 4 * q}
     first, second = (compare_with_limits(joint, PENDULUM[joint], columns, limits) for joint in (0, 1))
-    assert first.range_used == pytest.approx(1.0)
-    assert first.beyond_range == pytest.approx(50 / 201)
-    assert first.speed_used == pytest.approx(4.5 / 2)
-    assert first.beyond_speed == pytest.approx(np.mean(np.abs(3 * q) > 2))
-    assert (first.torque_used, first.beyond_torque) == (None, None)
-    assert (second.speed_used, second.beyond_speed) == (None, None)
+    assert (first.range_used, first.beyond_range) == pytest.approx((1.0, 50 / 201))
+    assert (first.speed_used, first.beyond_speed) == pytest.approx((4.5 / 2, np.mean(np.abs(3 * q) > 2)))
+    assert (first.torque_used, first.beyond_torque, second.speed_used, second.beyond_speed) == (None,) * 4
     assert second.torque_used == pytest.approx(6 / 5)
     unknown = compare_with_limits(0, "joint1", columns, None)
     assert set(unknown.model_dump(exclude={"joint"}).values()) == {None}
@@ -117,23 +108,15 @@ def test_clipped_torque_is_reported() -> None:
     assert detect_saturation(0, "joint1", np.cos(t), full, limits).at_limit is None
 
 
-@pytest.fixture
-def troubled(tmp_path: Path) -> DatasetReport:
+def test_defects_of_signals_are_described(tmp_path: Path) -> None:
     columns = dict(recording("double-pendulum", 30.0, 100.0, 5))
-    columns["ddq"] = np.gradient(columns["dq"], 0.01, axis=0)
-    most = np.abs(columns["tau"]).max(axis=0) / 2
-    columns["tau"] = np.clip(columns["tau"], -most, most)
-    columns["q"] = columns["q"].copy()
-    columns["q"][200:300, 0] = np.nan
-    return report_on(tmp_path, PENDULUM, columns, robot(upper=np.array([0.1, 1.0])), AS_IT_IS)
-
-
-def test_defects_of_signals_are_described(troubled: DatasetReport) -> None:
+    most, q = np.abs(columns["tau"]).max(axis=0) / 2, columns["q"].copy()
+    q[200:300, 0] = np.nan
+    columns |= {"q": q, "ddq": np.gradient(columns["dq"], 0.01, axis=0), "tau": np.clip(columns["tau"], -most, most)}
+    troubled = report_on(tmp_path, PENDULUM, columns, robot(upper=np.array([0.1, 1.0])), AS_IT_IS)
     reply = " ".join(troubled.warnings)
-    assert "100 of 3000 rows lack a value" in reply
-    assert "Positions of joint1" in reply
-    assert "exceed the robot's limits" in reply
-    assert "was clipped" in reply
+    for words in ("100 of 3000 rows lack a value", "Positions of joint1", "exceed the robot's limits", "was clipped"):
+        assert words in reply
     assert troubled.robot == "arm"
     assert troubled.noise[0].velocity == pytest.approx(0, abs=1e-3)
 
@@ -148,10 +131,8 @@ def test_known_lag_is_found(tmp_path: Path, rate: float, late: float) -> None:
     assert all(each.improves == list(PENDULUM) for each in report.lag[:1]) == (abs(late) > 0.01)
     reply = " ".join(report.warnings)
     assert ("not synchronised" in reply) == (abs(late) > 0.01)
-    if late > 0.01:
-        assert "torque lags motion" in reply
-    if late < -0.01:
-        assert "torque leads motion" in reply
+    assert ("torque lags motion" in reply) == (late > 0.01)
+    assert ("torque leads motion" in reply) == (late < -0.01)
 
 
 def test_held_out_errors_match_fits_without_one_eighth() -> None:
@@ -163,9 +144,8 @@ def test_held_out_errors_match_fits_without_one_eighth() -> None:
     fit = Fit(np.arange(203), whitened, np.eye(6), np.zeros(6), np.ones(6), 203.0)
     both = np.column_stack([np.ones(203), features])
     shrink = np.diag([0.0, *[penalty] * 6])
-    for part, errors in zip(
-        np.split(np.arange(203), np.linspace(0, 203, 9).astype(int)[1:-1]), fit.held_out(y), strict=True
-    ):
+    parts = np.split(np.arange(203), np.linspace(0, 203, 9).astype(int)[1:-1])
+    for part, errors in zip(parts, fit.held_out(y), strict=True):
         rest = np.delete(both, part, axis=0)
         weights = np.linalg.solve(rest.T @ rest + shrink, rest.T @ np.delete(y, part, axis=0))
         assert errors == pytest.approx(((y[part] - both[part] @ weights) ** 2).sum(axis=0), rel=1e-5)
@@ -205,21 +185,17 @@ def test_only_smoothed_torque_is_recognised_as_smoothed(rate: float) -> None:
     assert is_smoothed(exact, part, white_noise(exact, part))
 
 
-def test_torque_that_motion_does_not_explain_has_no_lag(tmp_path: Path) -> None:
-    columns = dict(recording("double-pendulum", 20.0, 100.0, 4))
-    columns["tau"] = np.random.default_rng(1).standard_normal(columns["tau"].shape)
-    report = report_on(tmp_path, PENDULUM, columns)
+def test_unexplained_torque_and_slow_motion_have_no_lag(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    columns = recording("double-pendulum", 20.0, 100.0, 4)
+    report = report_on(tmp_path, PENDULUM, columns | {"tau": rng.standard_normal(columns["tau"].shape)})
     assert all(each.seconds is None and each.reason for each in report.lag)
     assert "explains only" in (report.lag[1].reason or "")
-
-
-def test_slow_motion_shows_no_lag(tmp_path: Path) -> None:
     t = np.arange(3000) / 100
     q = np.column_stack([0.5 * np.sin(0.3 * t), 0.4 * np.sin(0.2 * t)])
-    tau = 3 * q + 0.02 * np.random.default_rng(1).standard_normal(q.shape)
-    report = report_on(tmp_path, PENDULUM, {"t": t, "q": q, "tau": tau})
-    assert report.lag[0].seconds is None
-    assert "record faster motion" in (report.lag[1].reason or "")
+    slow = report_on(tmp_path, PENDULUM, {"t": t, "q": q, "tau": 3 * q + 0.02 * rng.standard_normal(q.shape)})
+    assert slow.lag[0].seconds is None
+    assert "record faster motion" in (slow.lag[1].reason or "")
 
 
 @pytest.mark.parametrize(("rate", "longest"), [(30.0, 10_000), (250.0, 10_000), (1000.0, 400), (5000.0, 10**6)])
@@ -250,24 +226,21 @@ def test_parts_are_numbered_by_their_breaks(lengths: list[int]) -> None:
 def test_thinned_rows_keep_their_distance_from_the_ends(lengths: list[int], most: int, margin: int) -> None:
     part = parts_of(lengths)
     rows = thin(part, most, margin)
-    allowed = [
-        row for row in range(len(part)) if margin <= row - (part < part[row]).sum() < lengths[part[row]] - margin
-    ]
+    allowed = {row for row, k in enumerate(part) if margin <= row - (part < k).sum() < lengths[k] - margin}
     assert len(rows) == min(most, len(allowed))
     assert (np.diff(rows) > 0).all()
-    assert set(rows.tolist()) <= set(allowed)
+    assert set(rows.tolist()) <= allowed
 
 
 def test_noise_is_that_of_noise_level() -> None:
     rng = np.random.default_rng(1)
     part = parts_of([200, 5, 90, 1, 300])
     values = np.sin(np.arange(len(part)) / 50) + 0.02 * rng.standard_normal(len(part))
-    episodes = [values[part == k][:, None] for k in range(5)]
-    assert white_noise(values, part) == pytest.approx(noise_level(episodes)[0], rel=1e-12)
     short = parts_of([2, 2, 2])
-    episodes = [values[:6][short == k][:, None] for k in range(3)]
+    for noise, of in ((white_noise, part), (noise_or_default, short)):
+        episodes = [values[: len(of)][of == k][:, None] for k in np.unique(of)]
+        assert noise(values[: len(of)], of) == pytest.approx(noise_level(episodes)[0], rel=1e-12)
     assert white_noise(values[:6], short) is None
-    assert noise_or_default(values[:6], short) == pytest.approx(noise_level(episodes)[0], rel=1e-12)
 
 
 @given(st.integers(1, 300), st.integers(2, 80), st.integers(0, 5))

@@ -20,7 +20,7 @@ from service.storage import sample_file
 from service.storage.database import JobRow
 from service.storage.disk import Disk
 from tests.service.data import arrays, npz, post, queue, service_of, stream
-from tests.service.datasets.test_format_parquet import parquet
+from tests.service.datasets.reading import parquet
 from tests.service.datasets.test_uploads import read_created
 
 SAMPLES = stream(samples=600, rate=100.0, seed=71)
@@ -48,16 +48,12 @@ def test_recipe_and_source_of_an_upload_are_kept(api):
         **{f"arm_{joint}/pos": pa.array(np.degrees(SAMPLES.q[:, joint])) for joint in range(2)},
         **{f"arm_{joint}/torque": pa.array(SAMPLES.tau[:, joint]) for joint in range(2)},
     }
-    answer = post(
-        api,
-        parquet(columns),
-        "application/vnd.apache.parquet",
-        columns='{"t": "stamp", "q": "arm_{joint}/pos", "tau": "arm_{joint}/torque"}',
-        units='{"t": "ms", "q": "deg"}',
-        cutoff=6,
-        rate=50,
-        joint_names="shoulder,elbow",
-    )
+    query = {
+        "columns": '{"t": "stamp", "q": "arm_{joint}/pos", "tau": "arm_{joint}/torque"}',
+        "units": '{"t": "ms", "q": "deg"}',
+        "joint_names": "shoulder,elbow",
+    }
+    answer = post(api, parquet(columns), "application/vnd.apache.parquet", cutoff=6, rate=50, **query)
     dataset = read_created(answer)
     report = dataset["report"]
     assert dataset["joint_names"] == ["shoulder", "elbow"]

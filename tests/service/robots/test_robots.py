@@ -62,9 +62,8 @@ def test_uploaded_robot_is_shown_with_its_joints(api, form):
     assert answer.status_code == 201, answer.text
     robot = answer.json()
     assert robot["id"].startswith("urdf_")
-    assert robot["name"] == "arm"
+    assert (robot["name"], robot["sha256"]) == ("arm", hashlib.sha256(body).hexdigest())
     assert robot["joints"] == [{"name": f"joint{i}", "type": "revolute"} for i in (1, 2)]
-    assert robot["sha256"] == hashlib.sha256(body).hexdigest()
     assert answer.headers["location"] == f"/v1/robots/{robot['id']}"
     assert api.get(answer.headers["location"]).json() == robot
 
@@ -97,10 +96,8 @@ def test_profile_of_an_uploaded_urdf(empty):
     robot = add_robot(empty, urdf(kind="revolute"), name="mine")
     profile = empty.get(f"/v1/robots/profiles/{robot['id']}").json()
     assert (profile["name"], profile["effort"], profile["urdf_available"]) == ("mine", "unknown", True)
-    assert [joint["name"] for joint in profile["joints"]] == ["joint1", "joint2"]
-    assert [joint["max_torque"] for joint in profile["joints"]] == [1.0, 1.0]
-    reply = error(empty.get("/v1/robots/profiles/r2d2"), 404, "not_found")
-    assert "r2d2" in reply["message"]
+    assert [(joint["name"], joint["max_torque"]) for joint in profile["joints"]] == [("joint1", 1.0), ("joint2", 1.0)]
+    assert "r2d2" in error(empty.get("/v1/robots/profiles/r2d2"), 404, "not_found")["message"]
     database = service_of(empty).database
     assert store.profile_of(database, robot["id"]).urdf == urdf(kind="revolute").decode()
     assert store.profile_of(database, "fr3").title == "Franka Research 3"
@@ -142,39 +139,36 @@ def test_unusable_stored_robot_is_reported(empty):
     assert f"robot {robot} can no longer be used: <axis xyz> of joint 'joint1' is '0 0 0'" in message
 
 
-def post_job(api, dataset, **request):
-    return api.post("/v1/jobs", json={"model": "refused", "datasets": [dataset], "options": QUICK, **request})
-
-
 def test_job_with_an_unsuitable_robot_is_rejected(api, pendulum):
     before = api.get("/v1/jobs").json()
     other = add_robot(api, urdf(joints=("shoulder", "elbow")))["id"]
     sliding = add_robot(api, urdf(kind="prismatic"))["id"]
+    base = {"model": "refused", "datasets": [pendulum["id"]], "estimator": "rigid-body", "options": QUICK}
     fixed = {"options": {**QUICK, "geometry": "fixed"}}
-    for request, messages in (
-        (fixed, ["geometry is 'fixed', which needs a robot: a profile such as panda, or a URDF"]),
-        ({"robot": "panda"}, [*ROBOTS["panda"].free, "joint1, joint2"]),
-        ({"robot": other}, ["shoulder, elbow; the data have joint1, joint2"]),
-        ({"robot": sliding}, ["joint 'joint1' is revolute in the data", "is prismatic"]),
-        ({"robot": "r2d2"}, ["robot is 'r2d2', expected one of panda, ur3", "uploaded URDF"]),
-        ({"robot": "fr3"}, ["the profile of Franka Research 3 has no URDF", "upload a URDF"]),
-        ({"robot": "double-pendulum", "estimator": "lip-chain"}, ["'lip-chain' does not use a robot, only rigid-body"]),
+    for request, field, *messages in (
+        (fixed, "robot", "geometry is 'fixed', which needs a robot: a profile such as panda, or a URDF"),
+        ({"robot": "panda"}, "robot", *ROBOTS["panda"].free, "joint1, joint2"),
+        ({"robot": other}, "robot", "shoulder, elbow; the data have joint1, joint2"),
+        ({"robot": sliding}, "robot", "joint 'joint1' is revolute in the data", "is prismatic"),
+        ({"robot": "r2d2"}, "robot", "robot is 'r2d2', expected one of panda, ur3", "uploaded URDF"),
+        ({"robot": "fr3"}, "robot", "the profile of Franka Research 3 has no URDF", "upload a URDF"),
+        (
+            {"robot": "double-pendulum", "estimator": "lip-chain"},
+            "robot",
+            "'lip-chain' does not use a robot, only rigid-body",
+        ),
+        ({"options": {"prior": "flat"}}, "options.prior"),
     ):
-        reply = error(post_job(api, pendulum["id"], **{"estimator": "rigid-body", **request}), 422, "invalid_request")
-        assert reply["detail"][0]["field"] == "robot"
+        reply = error(api.post("/v1/jobs", json=base | request), 422, "invalid_request")
+        assert reply["detail"][0]["field"] == field
         assert all(message in reply["message"] for message in messages), reply["message"]
-    reply = error(
-        post_job(api, pendulum["id"], estimator="rigid-body", options={"prior": "flat"}), 422, "invalid_request"
-    )
-    assert reply["detail"][0]["field"] == "options.prior"
     assert api.get("/v1/jobs").json() == before
 
 
 def test_robot_in_use_is_kept(no_worker, empty):
     dataset, robot = upload(empty, stream())["id"], add_robot(empty, urdf())["id"]
-    job = queue(
-        empty, "waits", dataset, estimator="rigid-body", robot=robot, options={**QUICK, "posterior_samples": 40}
-    )
+    few = {**QUICK, "posterior_samples": 40}
+    job = queue(empty, "waits", dataset, estimator="rigid-body", robot=robot, options=few)
     assert job["robot"] == robot
     assert job["id"] in error(empty.delete(f"/v1/robots/{robot}"), 409, "conflict")["message"]
     assert empty.post(f"/v1/jobs/{job['id']}/cancel").status_code == 200
@@ -210,12 +204,10 @@ def test_profile_trains_and_predicts(api, panda):
 def test_uploaded_urdf_trains_like_its_profile(api, pendulum):
     robot = add_robot(api, profile_urdf("double-pendulum").encode(), name="my pendulum")
     assert [joint["name"] for joint in robot["joints"]] == list(load_robot("double-pendulum").joint_names)
+    query, answers = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}, []
     for model, name in (("by-upload", robot["id"]), ("by-profile", "double-pendulum")):
         train(api, model, pendulum["id"], estimator="rigid-body+lip-chain", robot=name)
-    query = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}
-    answers = [
-        api.post(f"/v1/models/{model}/predict", json=query).json()["tau"] for model in ("by-upload", "by-profile")
-    ]
+        answers.append(api.post(f"/v1/models/{model}/predict", json=query).json()["tau"])
     assert np.allclose(*answers)
     assert api.get("/v1/models/by-upload/versions/1").json()["robot"]["name"] == "my pendulum"
     assert api.delete(f"/v1/robots/{robot['id']}").status_code == 204
@@ -231,14 +223,13 @@ def test_command_line_and_client_manage_robots(server, lipserve, tmp_path):  # n
     arm.write_text(profile_urdf("double-pendulum"))
     text.write_text("no XML")
     common = ("train", recording, "--url", server.url, "--model", "by-cli", "--estimator", "rigid-body")
-    code, _, wrong = lipserve(*common, "--robot", arm)
-    assert code == 0, wrong
-    code, _, wrong = lipserve(*common, "--robot", tmp_path / "missing.urdf")
-    assert (code, "missing.urdf" in wrong) == (1, True)
-    code, _, wrong = lipserve(*common, "--base", "panda-sim")
-    assert (code, "--base is panda-sim:1, expected a version with the joint_names of the data" in wrong) == (1, True), (
-        wrong
-    )
+    for options, expected, message in (
+        (("--robot", arm), 0, ""),
+        (("--robot", tmp_path / "missing.urdf"), 1, "missing.urdf"),
+        (("--base", "panda-sim"), 1, "--base is panda-sim:1, expected a version with the joint_names of the data"),
+    ):
+        code, _, wrong = lipserve(*common, *options)
+        assert (code, message in wrong) == (expected, True), wrong
     with Client(server.url) as client:
         assert client.version("by-cli", 1).robot["name"] == "2dof_planar"
         with pytest.raises(ApiError, match="not well-formed"):
