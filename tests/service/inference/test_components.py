@@ -9,8 +9,8 @@ from lipcore.data.motion import Motion
 from lipcore.kernels.independent import SquaredExponentialKernel
 from lipcore.model import dynamics
 from service.inference import predicting
-from service.inference.predicting import MAX_COMPONENT_BATCH
 from tests.service.data import error
+from tests.service.models.versions import predict, predict_json
 
 NAMES = list(dynamics.COMPONENTS)
 SHAPES = {"inertia_matrix": (2, 2), "kinetic_energy": (), "potential_energy": ()}
@@ -22,27 +22,15 @@ def motion(trained):
     return {name: getattr(trained.samples, name)[10:60:10] for name in ("q", "dq", "ddq")}
 
 
-def post(api, model, motion, **request):
-    body = {name: np.asarray(values).tolist() for name, values in motion.items()}
-    return api.post(f"/v1/models/{model}/predict", json=body | request)
-
-
-def query_components(api, model, motion, **request):
-    answer = post(api, model, motion, **request)
-    assert answer.status_code == 200, answer.text
-    return answer.json()
-
-
-def rejection(api, model, motion, **request):
-    reply = error(post(api, model, motion, **request), 422, "invalid_request")
-    return reply["detail"][0]
+def rejection(api, model, **request):
+    return error(predict(api, model, **request), 422, "invalid_request")["detail"][0]
 
 
 @pytest.mark.parametrize("rows", [None, 1, 5])
 def test_components_equal_lipcore_in_the_shape_of_the_query(api, trained, motion, rows):
     query = {name: values[0] if rows is None else values[:rows] for name, values in motion.items()}
     tau, states = 0.1 * query["q"], Motion.from_arrays(**query)
-    answer = query_components(api, trained.name, query, components=NAMES, tau=tau.tolist())
+    answer = predict_json(api, trained.name, **query, components=NAMES, tau=tau)
     expected = dynamics.components(trained.model, states, NAMES, np.atleast_2d(tau))
     lead = () if rows is None else (rows,)
     assert list(answer["components"]) == NAMES
@@ -50,10 +38,10 @@ def test_components_equal_lipcore_in_the_shape_of_the_query(api, trained, motion
         result = answer["components"][name]
         assert set(result) == {"mean", "std"}
         scale = float(np.abs(estimate.mean).max())
-        assert np.shape(result["mean"]) == np.shape(result["std"]) == (*lead, *SHAPES.get(name, (2,))), name
-        mean, std = np.ravel(estimate.mean), np.ravel(estimate.std)
-        np.testing.assert_allclose(np.ravel(result["mean"]), mean, rtol=1e-9, atol=1e-9 * scale)
-        np.testing.assert_allclose(np.ravel(result["std"]), std, rtol=1e-5, atol=1e-9 * scale)
+        for part, rtol in (("mean", 1e-9), ("std", 1e-5)):
+            assert np.shape(result[part]) == (*lead, *SHAPES.get(name, (2,))), name
+            values = np.ravel(getattr(estimate, part))
+            np.testing.assert_allclose(np.ravel(result[part]), values, rtol=rtol, atol=1e-9 * scale)
 
 
 @pytest.mark.parametrize(
@@ -67,22 +55,19 @@ def test_components_equal_lipcore_in_the_shape_of_the_query(api, trained, motion
     ],
 )
 def test_wrong_component_requests_are_rejected(api, trained, motion, request_, field, value):
-    reply = rejection(api, trained.name, motion, **request_)
+    reply = rejection(api, trained.name, **motion, **request_)
     assert (reply["field"], reply["value"]) == (field, value)
 
 
 def test_batches_with_components_are_smaller(api, trained, motion):
-    limit = MAX_COMPONENT_BATCH
-    assert limit == 100
+    limit = 100
     many = {name: np.repeat(values[:1], limit + 1, axis=0) for name, values in motion.items()}
-    reply = rejection(api, trained.name, many, components=["gravity"])
+    reply = rejection(api, trained.name, **many, components=["gravity"])
     assert (reply["field"], reply["value"]) == ("q", "101 queries")
     assert "at most 100" in reply["expected"]
     largest = {name: values[:limit] for name, values in many.items()}
-    assert (
-        len(query_components(api, trained.name, largest, components=["gravity"])["components"]["gravity"]["mean"])
-        == limit
-    )
+    answer = predict_json(api, trained.name, **largest, components=["gravity"])
+    assert len(answer["components"]["gravity"]["mean"]) == limit
 
 
 def test_missing_component_error_lists_the_available_ones(trained):

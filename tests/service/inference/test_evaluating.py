@@ -11,18 +11,18 @@ from service.models import registry
 from service.models.evaluation import stretches
 from tests.service.data import error, service_of, stream, upload
 
-FIGURES = ("nmse", "rmse", "coverage", "nlpd")
-
 
 def assert_metrics(answer, metrics):
-    for name in FIGURES:
-        np.testing.assert_allclose(np.array(answer[name], dtype=float), getattr(metrics, name), rtol=1e-10)
-    np.testing.assert_allclose(answer["interval_width"], metrics.width, rtol=1e-10)
     assert answer["level"] == metrics.level == 0.95
-    for row, interval in enumerate(answer["coverages"]):
-        np.testing.assert_allclose(interval["coverage"], metrics.coverages[row], rtol=1e-10)
-        np.testing.assert_allclose(interval["interval_width"], metrics.widths[row], rtol=1e-10)
-    np.testing.assert_allclose(answer["reliability"]["observed"], metrics.reliability.T, rtol=1e-10)
+    intervals = answer["coverages"]
+    for found, values in (
+        *((answer[name], getattr(metrics, name)) for name in ("nmse", "rmse", "coverage", "nlpd")),
+        (answer["interval_width"], metrics.width),
+        ([each["coverage"] for each in intervals], metrics.coverages),
+        ([each["interval_width"] for each in intervals], metrics.widths),
+        (answer["reliability"]["observed"], metrics.reliability.T),
+    ):
+        np.testing.assert_allclose(np.array(found, dtype=float), values, rtol=1e-10)
 
 
 def post_evaluation(api, model, dataset, **request):
@@ -34,45 +34,27 @@ def expected(model, samples):
     return evaluate(samples.tau, *answer.interval)
 
 
-@pytest.fixture(scope="module")
-def unseen_dataset(api):
-    """A data set of the pendulum that no model was trained on."""
-    return upload(api, stream(seed=7))["id"]
-
-
-def test_metrics_equal_lipcore(api, trained, unseen_dataset):
-    answer = post_evaluation(api, trained.name, unseen_dataset)
-    assert answer.status_code == 200
-    assert_metrics(answer.json(), expected(trained.model, stream(seed=7)))
-
-
-def test_answer_describes_the_comparison(api, trained, unseen_dataset):
-    answer = post_evaluation(api, trained.name, unseen_dataset, version=1).json()
+def test_metrics_equal_lipcore_and_the_answer_describes_the_comparison(api, trained):
+    dataset = upload(api, stream(seed=7))["id"]  # no model was trained on it
+    serving, first = (post_evaluation(api, trained.name, dataset, **chosen) for chosen in ({}, {"version": 1}))
+    answer = first.json()
+    assert (serving.status_code, serving.json()) == (200, answer)
+    assert_metrics(answer, expected(trained.model, stream(seed=7)))
     assert (answer["model"], answer["version"], answer["revision"]) == (trained.name, 1, 0)
-    assert (answer["dataset"], answer["samples"], answer["samples_used"]) == (unseen_dataset, 80, 80)
+    assert (answer["dataset"], answer["samples"], answer["samples_used"]) == (dataset, 80, 80)
     assert answer["joint_names"] == ["joint1", "joint2"]
     assert (answer["stretches"]["kind"], answer["stretches"]["samples"]) == ("equal", [8] * 10)
     np.testing.assert_allclose(np.mean(answer["stretches"]["nmse"], axis=1), answer["nmse"], rtol=1e-9)
 
 
-@pytest.fixture
-def panda(strict):
-    """A data set of the shipped model's robot, larger than one evaluation."""
-    return upload(strict, stream("panda", 120, motion="middle"))["id"]
-
-
-def test_large_data_set_is_thinned_evenly_with_a_note(strict, panda):
-    answer = post_evaluation(strict, "panda-sim", panda).json()
-    assert (answer["samples"], answer["samples_used"]) == (120, 50)
-    assert answer["in_training"] is False
+def test_large_data_set_is_thinned_evenly_and_the_shipped_model_predicts_it(strict):
+    samples = stream("panda", 120, motion="middle")
+    answer = post_evaluation(strict, "panda-sim", upload(strict, samples)["id"]).json()
+    assert (answer["samples"], answer["samples_used"], answer["in_training"]) == (120, 50, False)
     service = service_of(strict)
     model = lipcore.load(service.files.version_folder(registry.find(service.database, "panda-sim", 1).folder))
     rows = np.round(np.arange(50) * 119 / 49).astype(np.int64)
-    assert_metrics(answer, expected(model, stream("panda", 120, motion="middle").rows(rows)))
-
-
-def test_shipped_model_is_accurate_and_calibrated(strict, panda):
-    answer = post_evaluation(strict, "panda-sim", panda).json()
+    assert_metrics(answer, expected(model, samples.rows(rows)))
     assert max(answer["nmse"][:6]) < 0.1  # the last joint's torque is barely above the noise
     assert min(answer["coverage"]) > 0.8
 

@@ -136,9 +136,8 @@ def test_open_inference_protocol_rejects_incomplete_inputs(streaming):
     motion = dict(zip(("q", "dq", "ddq"), motions(1)[0], strict=True))
 
     def rejection(inputs, *names):
-        return error_message(
-            streaming.server.client.post(infer_path("pendulum"), json=message(motion | inputs, *names))
-        )
+        request = message(motion | inputs, *names)
+        return error_message(streaming.server.client.post(infer_path("pendulum"), json=request))
 
     missing = "`tau` is required for forward_dynamics or tau_external"
     assert rejection({}, "tau_external_p").startswith(missing)

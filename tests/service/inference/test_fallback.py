@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 
 from lipserve import Client, StreamClient
 from tests.service.api.oip.requests import infer, message, tensors
+from tests.service.models.versions import predict_json
 from tests.service.streams import (
     ASK_EXTERNAL,
     EXTERNAL,
@@ -37,26 +38,18 @@ def expected(trained):
     return answer
 
 
-def predict(api, model, motion):
-    body = {name: values.tolist() for name, values in motion.items()}
-    answer = api.post(f"/v1/models/{model}/predict", json=body)
-    assert answer.status_code == 200, answer.text
-    return answer.json()
-
-
 def test_http_answers_the_fallback_share_of_each_joint(api, trained, expected):
-    batch = predict(api, trained.name, query(NEAR, FAR))
+    both, far = query(NEAR, FAR), {name: values[0] for name, values in query(FAR).items()}
+    batch, single = (predict_json(api, trained.name, **motion) for motion in (both, far))
     assert_allclose(batch["fallback"], expected.fallback.share, **EXACT)
     assert_allclose(batch["tau"], expected.tau, **EXACT)
     assert_allclose(batch["tau_std"], expected.tau_std, **EXACT)
-    single = predict(api, trained.name, {name: values[1] for name, values in query(NEAR, FAR).items()})
-    assert single["fallback"] == batch["fallback"][1]
-    assert single["tau"] == batch["tau"][1]
+    assert [single[name] for name in ("fallback", "tau")] == [batch[name][1] for name in ("fallback", "tau")]
 
 
 def test_http_omits_the_field_without_fallback(api, trained):
-    assert "fallback" not in predict(api, trained.name, query(NEAR))
-    assert "fallback" not in predict(api, trained.name, {name: values[0] for name, values in query(NEAR).items()})
+    for motion in (query(NEAR), {name: values[0] for name, values in query(NEAR).items()}):
+        assert "fallback" not in predict_json(api, trained.name, **motion)
 
 
 @pytest.mark.parametrize("rows", [[NEAR], [FAR], [NEAR, FAR]], ids=["near", "far", "both"])

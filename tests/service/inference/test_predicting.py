@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tests.service.data import error
-
-EXACT = {"rtol": 1e-12, "atol": 1e-12}
+from tests.service.models.versions import predict, predict_json
 
 
 @pytest.fixture(scope="module")
@@ -14,35 +13,26 @@ def motion():
     return dict(zip(("q", "dq", "ddq"), np.random.default_rng(4).uniform(-2, 2, (3, 12, 2)), strict=True))
 
 
-def post_query(api, model, motion, **request):
-    body = {name: np.asarray(values).tolist() for name, values in motion.items()}
-    answer = api.post(f"/v1/models/{model}/predict", json=body | request)
-    assert answer.status_code == 200, answer.text
-    return answer.json()
-
-
 def test_batch_is_answered_as_by_lipcore(api, trained, motion):
-    answer = post_query(api, trained.name, motion, covariance=True)
+    answer = predict_json(api, trained.name, **motion, covariance=True)
     expected = trained.model.predict(**motion, covariance=True)
-    np.testing.assert_allclose(answer["tau"], expected.tau, **EXACT)
-    np.testing.assert_allclose(answer["tau_std"], expected.tau_std, **EXACT)
-    np.testing.assert_allclose(answer["covariance"], expected.covariance, **EXACT)
-    np.testing.assert_allclose(answer["noise_std"], expected.noise_std, **EXACT)
+    for name in ("tau", "tau_std", "covariance", "noise_std"):
+        np.testing.assert_allclose(answer[name], getattr(expected, name), rtol=1e-12, atol=1e-12)
 
 
 def test_single_query_is_answered_as_a_row_of_a_batch(api, trained, motion):
-    batch = post_query(api, trained.name, motion, covariance=True)
+    batch = predict_json(api, trained.name, **motion, covariance=True)
     for row in range(12):
-        single = post_query(api, trained.name, {name: values[row] for name, values in motion.items()}, covariance=True)
+        query = {name: values[row] for name, values in motion.items()}
+        single = predict_json(api, trained.name, **query, covariance=True)
         for name in ("tau", "tau_std", "covariance"):
             np.testing.assert_allclose(single[name], batch[name][row], rtol=1e-9, atol=1e-12)
 
 
 def rejection(api, width=7, rows=None, **changes):
     """Send a query of zeros with some changes; return the first detail of its error."""
-    zeros = np.zeros(width if rows is None else (rows, width)).tolist()
-    answer = api.post("/v1/models/panda-sim/predict", json={"q": zeros, "dq": zeros, "ddq": zeros} | changes)
-    return error(answer, 422, "invalid_request")["detail"][0]
+    query = dict.fromkeys(("q", "dq", "ddq"), np.zeros(width if rows is None else (rows, width)))
+    return error(predict(api, "panda-sim", **(query | changes)), 422, "invalid_request")["detail"][0]
 
 
 @pytest.mark.parametrize("rows", [None, 2])
@@ -61,13 +51,12 @@ def test_batch_size_is_limited(strict):
 
 def test_large_velocities_are_not_clipped(strict):
     """Twice the speed gives four times the centrifugal torque, so no value in between is clipped."""
-    zero = [0.0] * 7
+    zero, one = np.zeros(7), np.eye(7)[0]
     slow, fast = (
-        np.array(post_query(strict, "panda-sim", {"q": zero, "dq": [speed, *zero[1:]], "ddq": zero})["tau"])
-        for speed in (1e3, 2e3)
+        np.abs(predict_json(strict, "panda-sim", q=zero, dq=speed * one, ddq=zero)["tau"]).max() for speed in (1e3, 2e3)
     )
-    assert np.abs(slow).max() > 1e3
-    assert np.abs(fast).max() > 1.5 * np.abs(slow).max()
+    assert slow > 1e3
+    assert fast > 1.5 * slow
 
 
 @pytest.mark.parametrize("path", ["/v1/models/panda-sim/predict", "/v1/echo", "/v1/jobs"])

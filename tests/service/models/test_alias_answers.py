@@ -1,17 +1,15 @@
 """An alias can replace a version number everywhere; answers follow it atomically and name the version."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import pytest
 
 from service.inference.predicting import queries
+from tests.service.api.oip.requests import message
 from tests.service.data import service_of, stream, upload
 from tests.service.models.versions import QUERY, predict, publish, train_worse
-
-BINARY = {
-    "inputs": [{"name": name, "shape": [2], "datatype": "FP64", "data": QUERY[name]} for name in ("q", "dq", "ddq")]
-}
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +31,14 @@ def test_queries_are_answered_by_the_alias_target(api, arm):
 
 
 def test_hot_route_resolves_aliases(api, arm):
-    query = queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production"}')
+    def decode(more):
+        return queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production' + more + b"}")
+
+    query = decode(b'"')
     assert query.alias == "production"
     assert service_of(api).loaded.hot(arm, query.version, query.alias).version == 1
-    assert queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production\\n"}') is None
-    assert queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production", "version": 1}') is None
+    assert decode(b'\\n"') is None
+    assert decode(b'", "version": 1') is None
 
 
 def test_evaluations_follow_an_alias(api, arm):
@@ -49,13 +50,14 @@ def test_evaluations_follow_an_alias(api, arm):
 
 
 def test_open_inference_protocol_resolves_aliases(api, arm):
-    answer = api.post(f"/v2/models/{arm}/versions/production/infer", json=BINARY).json()
+    versions = f"/v2/models/{arm}/versions"
+    answer = api.post(f"{versions}/production/infer", json=message(QUERY)).json()
     assert answer["model_version"] == "1"
     assert answer["outputs"][0]["data"] == predict(api, arm, version=1).json()["tau"]
-    assert api.get(f"/v2/models/{arm}/versions/production").json()["parameters"]["version"] == "1"
-    assert api.get(f"/v2/models/{arm}/versions/serving/ready").json()["ready"]
-    assert api.post(f"/v2/models/{arm}/versions/serving/infer", json=BINARY).json()["model_version"] == "2"
-    refused = api.post(f"/v2/models/{arm}/versions/nowhere/infer", json=BINARY)
+    assert api.get(f"{versions}/production").json()["parameters"]["version"] == "1"
+    assert api.get(f"{versions}/serving/ready").json()["ready"]
+    assert api.post(f"{versions}/serving/infer", json=message(QUERY)).json()["model_version"] == "2"
+    refused = api.post(f"{versions}/nowhere/infer", json=message(QUERY))
     assert refused.status_code == 404
     assert "one of production, 1, 2" in refused.json()["error"]
 
@@ -71,16 +73,15 @@ def test_queries_follow_every_move_at_once_without_failure(api, arm):
             served = loaded.hot(arm, None, "moving")
             seen.append(None if served is None else served.version)
 
-    thread = threading.Thread(target=query_repeatedly)
-    thread.start()
-    try:
-        for version in (2, 1) * 5:
-            assert api.put(f"/v1/models/{arm}/aliases/moving", json={"version": version}).status_code == 200
-            answer = predict(api, arm, alias="moving").json()
-            assert (answer["version"], answer["tau"]) == (version, expected[version])
-    finally:
-        stop.set()
-        thread.join()
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(query_repeatedly)
+        try:
+            for version in (2, 1) * 5:
+                assert api.put(f"/v1/models/{arm}/aliases/moving", json={"version": version}).status_code == 200
+                answer = predict(api, arm, alias="moving").json()
+                assert (answer["version"], answer["tau"]) == (version, expected[version])
+        finally:
+            stop.set()
     assert set(seen) == {1, 2}
     assert sum(one != other for one, other in pairwise(seen)) <= 10
 
@@ -90,11 +91,8 @@ def test_concurrent_moves_leave_memory_and_database_equal(api, arm):
         for _ in range(5):
             assert api.put(f"/v1/models/{arm}/aliases/contested", json={"version": version}).status_code == 200
 
-    threads = [threading.Thread(target=move_repeatedly, args=(version,)) for version in (1, 2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(move_repeatedly, (1, 2)))
     listed = {item["alias"]: item for item in api.get(f"/v1/models/{arm}/aliases").json()["items"]}["contested"]
     assert service_of(api).loaded.newest(arm, "contested") == listed["version"]
     moves = listed["history"]

@@ -7,9 +7,9 @@ import pytest
 
 from lipcore.data.metrics import Comparison, Difference, compare
 from service.inference.comparison import _verdict
-from tests.service.data import arrays, error, npz, post, stream, upload
-from tests.service.models.test_aliases import CODES
+from tests.service.data import error, stream, upload
 from tests.service.models.versions import publish, train_worse, trained_model
+from tests.service.training.conftest import assert_invalid
 
 SAMPLES = {"seed": 9, "samples": 400}
 
@@ -34,23 +34,18 @@ def post_comparison(api, model, dataset, *versions):
     return api.post(f"/v1/models/{model}/compare", json={"dataset": dataset, "versions": list(versions)})
 
 
-def expected():
-    samples = stream(**SAMPLES)
-    answers = [model.predict(samples.q, samples.dq, samples.ddq) for model in (train_worse(), trained_model())]
-    return compare(samples, *(each.interval for each in answers))
-
-
 def test_better_version_is_named_with_the_evidence(api, arm, recorded):
     found = post_comparison(api, arm, recorded["id"], 1, 2).json()
     assert (found["outcome"], found["better"]) == ("second_better", 2)
     assert found["verdict"].startswith("Version 2 predicts better than version 1: its negative log predictive density")
     assert (found["samples"], found["samples_used"], found["blocks"]) == (400, 400, 40)
-    exact = expected()
+    samples = stream(**SAMPLES)
+    answers = [model.predict(samples.q, samples.dq, samples.ddq) for model in (train_worse(), trained_model())]
+    exact = compare(samples, *(each.interval for each in answers))
     for name in ("nmse", "rmse", "coverage", "nlpd"):
         shown, figures = found["differences"][name], getattr(exact, name)
-        np.testing.assert_allclose(shown["difference"], figures.mean, rtol=1e-9)
-        np.testing.assert_allclose(shown["standard_error"], figures.standard_error, rtol=1e-9)
-        np.testing.assert_allclose(shown["half_width"], figures.half_width, rtol=1e-9)
+        for part, value in (("difference", "mean"), ("standard_error",) * 2, ("half_width",) * 2):
+            np.testing.assert_allclose(shown[part], getattr(figures, value), rtol=1e-9)
     for place, name in enumerate(("nlpd", "nmse")):
         np.testing.assert_allclose(found[name]["difference"], exact.total.mean[place], rtol=1e-9)
     assert found["warnings"] == []
@@ -61,10 +56,7 @@ def test_better_version_is_named_with_the_evidence(api, arm, recorded):
 
 
 def test_order_changes_the_signs_but_not_the_verdict(api, arm, recorded):
-    one, other = (
-        post_comparison(api, arm, recorded["id"], 1, 2).json(),
-        post_comparison(api, arm, recorded["id"], 2, 1).json(),
-    )
+    one, other = (post_comparison(api, arm, recorded["id"], *order).json() for order in ((1, 2), (2, 1)))
     assert (other["outcome"], other["better"], other["verdict"]) == ("first_better", 2, one["verdict"])
     assert other["nlpd"]["difference"] == pytest.approx(-one["nlpd"]["difference"])
 
@@ -87,24 +79,22 @@ def test_short_recording_is_inconclusive(api, arm):
 
 
 @pytest.mark.parametrize(
-    ("versions", "status", "field"),
+    ("versions", "refusal", "field"),
     [
-        ([3, "serving"], 422, "versions[1]"),
-        ([1, 9], 404, "version"),
-        ([1, "nowhere"], 404, "alias"),
+        ([3, "serving"], (422, "invalid_request"), "versions[1]"),
+        ([1, 9], (404, "not_found"), "version"),
+        ([1, "nowhere"], (404, "not_found"), "alias"),
     ],
 )
-def test_wrong_choices_are_named(api, arm, recorded, versions, status, field):
+def test_wrong_choices_are_named(api, arm, recorded, versions, refusal, field):
     answer = post_comparison(api, arm, recorded["id"], *versions)
-    assert error(answer, status, CODES[status])["detail"][0]["field"] == field
+    assert error(answer, *refusal)["detail"][0]["field"] == field
 
 
 def test_unsuitable_data_set_is_rejected(api, arm):
     error(post_comparison(api, arm, "ds_none", 1, 2), 404, "not_found")
-    others = stream(seed=7)
-    answer = post(api, npz(**arrays(others), joint_names=np.array(["a", "b"])))
-    refusal = error(post_comparison(api, arm, answer.json()["id"], 1, 2), 422, "invalid_request")
-    assert refusal["detail"][0]["field"] == "dataset"
+    others = upload(api, replace(stream(seed=7), joint_names=("a", "b")))["id"]
+    assert_invalid(post_comparison(api, arm, others, 1, 2), "dataset")
 
 
 def comparison(density, nmse, blocks=30):

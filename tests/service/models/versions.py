@@ -4,6 +4,8 @@ import json
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 import lipcore
 from lipcore import FitOptions, TorqueModel
 from lipcore.files import persistence
@@ -18,7 +20,7 @@ from tests.lipcore.arms import parameters_of
 from tests.service.data import QUICK, service_of, stream
 from tests.service.learning.pendulums import trained_model
 
-__all__ = ["QUERY", "predict", "publish", "train_worse", "trained_model"]
+__all__ = ["QUERY", "predict", "predict_json", "publish", "train_worse", "trained_model"]
 
 QUERY: dict[str, Any] = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}
 
@@ -42,8 +44,16 @@ def publish(api: Any, model: str, found: TorqueModel | None = None, lineage: Any
 
 
 def predict(api: Any, model: str, **chosen: Any) -> Any:
-    """Query a torque; return the answer."""
-    return api.post(f"/v1/models/{model}/predict", json=QUERY | chosen)
+    """Query a torque, of QUERY if no motion is given; return the answer."""
+    body = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in chosen.items()}
+    return api.post(f"/v1/models/{model}/predict", json=QUERY | body)
+
+
+def predict_json(api: Any, model: str, **chosen: Any) -> Any:
+    """Query a torque that must be answered; return the body."""
+    answer = predict(api, model, **chosen)
+    assert answer.status_code == 200, answer.text
+    return answer.json()
 
 
 WARNING = "Two arms explain it."

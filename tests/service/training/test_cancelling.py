@@ -42,39 +42,26 @@ def test_running_job_is_cancelled_without_a_version(api, panda):
     assert set(service_of(api).files.versions.iterdir()) == folders
 
 
-def test_cancel_while_the_model_is_saved_takes_effect(api, pendulum, monkeypatch):
-    service = service_of(api)
-    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
-    name = queue(api, "late", pendulum["id"])["id"]
-    save = worker.lipcore.save
+@pytest.mark.parametrize(
+    ("module", "step", "stage", "holdout"),
+    [(worker.lipcore, "save", "saving", None), (planned_fit, "refit", "all_rows", {"share": 0.3})],
+    ids=["save", "all-rows"],
+)
+def test_cancel_during_a_late_step_takes_effect(api, pendulum, run_here, monkeypatch, module, step, stage, holdout):
+    model, complete = f"late-{step}", getattr(module, step)
+    name = queue(api, model, pendulum["id"], holdout=holdout)["id"]
 
-    def cancel_and_save(*args):
-        assert api.post(f"/v1/jobs/{name}/cancel").json()["state"] == "running"
-        return save(*args)
-
-    monkeypatch.setattr(worker.lipcore, "save", cancel_and_save)
-    worker.run(service.settings, name)
-    assert job(api, name)["state"] == "cancelled"
-    error(api.get("/v1/models/late"), 404, "not_found")
-
-
-def test_cancel_while_all_rows_are_learnt_takes_effect(api, pendulum, monkeypatch):
-    service, refit = service_of(api), planned_fit.refit
-    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
-    name = queue(api, "last-fit", pendulum["id"], holdout={"share": 0.3})["id"]
-
-    def cancel_and_refit(model, task):
+    def cancel_and_complete(*given):
         assert job(api, name)["progress"]["fraction"] < 1
         assert api.post(f"/v1/jobs/{name}/cancel").json()["state"] == "running"
-        eventually(task.cancelled)
-        return refit(model, task)
+        if step == "refit":
+            eventually(given[1].cancelled)
+        return complete(*given)
 
-    monkeypatch.setattr(planned_fit, "refit", cancel_and_refit)
-    worker.run(service.settings, name)
-    seen = job(api, name)
-    assert (seen["state"], seen["version"]) == ("cancelled", None)
-    assert seen["progress"]["stage"] == "all_rows"
-    error(api.get("/v1/models/last-fit"), 404, "not_found")
+    monkeypatch.setattr(module, step, cancel_and_complete)
+    seen = run_here(name)
+    assert (seen["state"], seen["version"], seen["progress"]["stage"]) == ("cancelled", None, stage)
+    error(api.get(f"/v1/models/{model}"), 404, "not_found")
 
 
 def test_ended_job_cannot_be_cancelled(api, pendulum):

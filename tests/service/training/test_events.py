@@ -1,29 +1,24 @@
 """Server-sent events of a job: from its present state to its end, for any number of readers."""
 
 import asyncio
-import json
 from itertools import pairwise
+from unittest.mock import Mock, call
 
 import pytest
-from sqlalchemy import select
 
-from service.foundation.settings import Settings
-from service.storage.database import Database, JobRow
 from service.training import feed
 from service.training.feed import MAX_FOLLOWERS, JobEventStream
 from tests.service.data import error, queue, service_of, stream, upload
-from tests.service.learning.event_listener import follow_events
-from tests.service.training.conftest import new_row
+from tests.service.learning.event_listener import EventListener, follow_events
+
+FAST_OPTIONS = {"hyperparameter_samples": 20, "posterior_samples": 30, "max_iterations": 2}
 
 
 def read(text):
     """Return the events of a stream as pairs (kind, data)."""
-    found = []
-    for block in text.strip().split("\n\n"):
-        fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
-        if fields:
-            found.append((fields["event"], json.loads(fields["data"])))
-    return found
+    listener = EventListener()
+    asyncio.run(listener.send({"type": "http.response.body", "body": text.encode()}))
+    return listener.events
 
 
 def test_job_is_followed_from_start_to_end(api, pendulum):
@@ -48,57 +43,46 @@ def test_job_is_followed_from_start_to_end(api, pendulum):
     assert service_of(api).jobs.feed.open == 0
 
 
-def test_number_of_readers_is_limited(no_worker, monkeypatch):
-    name = queue(no_worker, "many", upload(no_worker, stream())["id"], options={**FAST_OPTIONS})["id"]
-    many = service_of(no_worker).jobs.feed
-    monkeypatch.setattr(many, "open", MAX_FOLLOWERS)
-    answer = no_worker.get(f"/v1/jobs/{name}/events")
-    error(answer, 429, "busy")
-    assert int(answer.headers["retry-after"]) > 0
+@pytest.fixture
+def waiting(no_worker):
+    """The path of the events of a job that stays queued."""
+    name = queue(no_worker, "waiting", upload(no_worker, stream())["id"], options=FAST_OPTIONS)["id"]
+    yield f"/v1/jobs/{name}/events"
     no_worker.post(f"/v1/jobs/{name}/cancel")
 
 
-FAST_OPTIONS = {"hyperparameter_samples": 20, "posterior_samples": 30, "max_iterations": 2}
+def test_number_of_readers_is_limited(no_worker, waiting, monkeypatch):
+    monkeypatch.setattr(service_of(no_worker).jobs.feed, "open", MAX_FOLLOWERS)
+    answer = no_worker.get(waiting)
+    error(answer, 429, "busy")
+    assert int(answer.headers["retry-after"]) > 0
 
 
-def test_reader_that_leaves_is_forgotten(no_worker):
-    name = queue(no_worker, "left", upload(no_worker, stream())["id"], options=FAST_OPTIONS)["id"]
-    with follow_events(no_worker, f"/v1/jobs/{name}/events") as listener:
+def test_reader_that_leaves_is_forgotten(no_worker, waiting):
+    with follow_events(no_worker, waiting) as listener:
         assert listener.status == 200
         assert listener.list_data("state")[0]["state"] == "queued"
     assert service_of(no_worker).jobs.feed.open == 0
     assert not service_of(no_worker).jobs.feed._followers
-    no_worker.post(f"/v1/jobs/{name}/cancel")
 
 
 @pytest.fixture
-def job_row(home, monkeypatch):
-    """A database of its own with one job, which a stream reads often."""
+def following(table, monkeypatch):
+    """A stream that often reads a table with one job."""
     monkeypatch.setattr(feed, "LOOK_S", 0.01)
-    database = Database.of(Settings(home=home))
-    with database.transaction() as session:
-        session.add(new_row("x"))
-    yield database
-    database.close()
+    table.add("x")
+    return JobEventStream(table.database)
 
 
-def change(database, **values):
-    with database.transaction() as session:
-        row = session.scalar(select(JobRow).where(JobRow.id == "job_x"))
-        for name, value in values.items():
-            setattr(row, name, value)
+async def until_read(following):
+    while "job_x" not in following._rows:
+        await asyncio.sleep(0.001)
 
 
-def row_of(database):
-    with database.session() as session:
-        return session.scalar(select(JobRow).where(JobRow.id == "job_x"))
-
-
-def test_many_readers_share_one_query(job_row, monkeypatch):
+def test_many_readers_share_one_query(table, following, monkeypatch):
     """Each reader sees every lasting change, even if it comes late or its first row is stale."""
-    following, looks = JobEventStream(job_row), []
-    look = following._look
-    monkeypatch.setattr(following, "_look", lambda jobs: (looks.append(jobs), look(jobs))[1])
+    look = Mock(wraps=following._look)
+    monkeypatch.setattr(following, "_look", look)
 
     async def follow_until(state, row):
         async for seen in following.follow(row, closing):
@@ -106,39 +90,35 @@ def test_many_readers_share_one_query(job_row, monkeypatch):
                 return seen.id
 
     async def run_readers():
-        stale = row_of(job_row)
+        stale = table.row("job_x")
         early = [asyncio.create_task(follow_until("running", stale)) for _ in range(20)]
-        while not looks:
+        while not look.called:
             await asyncio.sleep(0)
-        change(job_row, state="running")
+        table.change("job_x", state="running")
         assert await asyncio.gather(*early) == ["job_x"] * 20
 
         stay = asyncio.create_task(follow_until("succeeded", stale))
-        while "job_x" not in following._rows:
-            await asyncio.sleep(0.001)
+        await until_read(following)
         # the row does not change any more, but it was read before
         assert await follow_until("running", stale) == "job_x"
-        change(job_row, state="succeeded")
+        table.change("job_x", state="succeeded")
         assert await stay == "job_x"
 
     closing = asyncio.Event()
     asyncio.run(run_readers())
     assert not following._followers
     assert not following._rows
-    assert all(jobs == ["job_x"] for jobs in looks)
+    assert all(each == call(["job_x"]) for each in look.call_args_list)
 
 
-def test_readers_end_when_the_service_closes(job_row):
+def test_readers_end_when_the_service_closes(table, following):
+    async def read_states(closing):
+        return [seen.state async for seen in following.follow(table.row("job_x"), closing)]
+
     async def run_readers():
         closing = asyncio.Event()
-        following = JobEventStream(job_row)
-
-        async def read_states():
-            return [seen.state async for seen in following.follow(row_of(job_row), closing)]
-
-        tasks = [asyncio.create_task(read_states()) for _ in range(3)]
-        while "job_x" not in following._rows:
-            await asyncio.sleep(0.001)
+        tasks = [asyncio.create_task(read_states(closing)) for _ in range(3)]
+        await until_read(following)
         closing.set()
         assert all(states[0] == "queued" for states in await asyncio.gather(*tasks))
 

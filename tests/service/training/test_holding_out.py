@@ -1,6 +1,7 @@
 """Held-out data: which rows are held out, how the version is evaluated on them, and that they stay held out."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,30 +17,21 @@ from service.models import registry
 from service.models.archive_lineage import Lineage
 from service.models.lineage import describe_datasets, learnt_from
 from service.storage.database import DatasetRow
-from service.training import planned_fit, worker
+from service.training import planned_fit
 from service.training.holding_out import CannotHoldOutError, find_earlier_split
 from service.training.material import load_datasets
-from tests.service.data import (
-    QUICK,
-    arrays,
-    columns,
-    csv,
-    ended,
-    error,
-    npz,
-    post,
-    queue,
-    service_of,
-    stream,
-    train,
-    upload,
-)
-from tests.service.models.archives.packing import exported, import_archive
+from tests.service.data import QUICK, arrays, columns, csv, ended, npz, post, queue, service_of, stream, train, upload
+from tests.service.models.archives.packing import exported, imported
+from tests.service.training.conftest import assert_invalid, refresh, version_of
 
 ROWS = 120
 TRAIN, HELD_OUT = slice(0, 82), slice(86, ROWS)
 """At 10 Hz the last 36 of 120 rows are held out; 0.25 s before and after the boundary is two rows on each side."""
+ENTRY = {"id": "ds_1", "sha256": "s", "whole": False, "guard": 0.25, "guard_unit": "s", "rows": 34, "guarded": 4}
+HOLDOUT = {"split": {"share": 0.3}, "datasets": [ENTRY], "rows": 34, "guarded": 4, "nmse": [0.1]}
+EPISODE, TIMES = np.zeros(ROWS, dtype=np.int64), np.arange(ROWS) / 10
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
+REPETITION = ("repeats_training", "period_s", "warnings")
 
 
 def recording(seed=1):
@@ -50,8 +42,18 @@ def post_evaluation(api, model, dataset, **request):
     return api.post(f"/v1/models/{model}/evaluate", json={"dataset": dataset, **request})
 
 
-def version(api, model, number=1):
-    return api.get(f"/v1/models/{model}/versions/{number}").json()
+def evaluation(api, model, dataset, **request):
+    return post_evaluation(api, model, dataset, **request).json()
+
+
+def record_of(api, model, number=1):
+    return version_of(api, model, number)["lineage"]["holdout"]
+
+
+def assert_figures(found, expected):
+    """Compare the scores of two JSON objects."""
+    for name in FIGURES:
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-6)
 
 
 def json_numbers(value):
@@ -63,21 +65,18 @@ def json_numbers(value):
     return [] if isinstance(value, str) else [np.nan if value is None else value]
 
 
-def row_indices(samples, result):
+def row_indices(samples, part):
     """Return the rows' indices in a recording, found by their torques, which never repeat."""
     known = {row.tobytes(): index for index, row in enumerate(samples.tau)}
-    return [known[row.tobytes()] for row in np.ascontiguousarray(result.tau)]
+    return [known[row.tobytes()] for row in np.ascontiguousarray(part.tau)]
 
 
 def load_split(api, *datasets, **holdout):
+    """Return the learnt samples, those by which a job judges its version, and the record of the split."""
     service = service_of(api)
     request = {"datasets": list(datasets), "holdout": holdout, "joint_types": ["revolute"] * 2}
-    return load_datasets(service.database, service.files, request)
-
-
-def held_out(result):
-    """Return the rows by which a job judges its version."""
-    return result.held_out.thinned(ROWS * 10)
+    result = load_datasets(service.database, service.files, request)
+    return result.samples, result.held_out.thinned(ROWS * 10), result.lineage["holdout"]
 
 
 @pytest.fixture(scope="module")
@@ -87,83 +86,56 @@ def dataset(api):
 
 
 @pytest.fixture(scope="module")
-def held_out_model(api, dataset):
-    """A model whose training held out the last 30 % of its data set: its name and the job."""
-    return "held-out", train(api, "held-out", dataset, holdout={"share": 0.3})
+def jobs(api, dataset):
+    """The jobs of two models that hold out the last 30 % of their data set; `kept-out` never learns these rows."""
+    splits = {"held-out": {"share": 0.3}, "kept-out": {"share": 0.3, "only": True}}
+    return {model: train(api, model, dataset, holdout=split) for model, split in splits.items()}
 
 
-@pytest.fixture(scope="module")
-def excluding_model(api, dataset):
-    """The name of a model whose version never learns its held-out rows."""
-    job = train(api, "kept-out", dataset, holdout={"share": 0.3, "only": True})
-    assert job["holdout"]["only"] is True
-    return "kept-out"
+both_models = pytest.mark.parametrize(("model", "learnt"), [("held-out", True), ("kept-out", False)])
 
 
-def test_rest_is_judged_first_and_then_all_rows_are_learnt(api, held_out_model, excluding_model, dataset):
-    assert held_out_model[1]["holdout"] == {"kind": "auto", "share": 0.3, "blocks": 10, "guard_s": None, "seed": 0}
-    for model, rows, learnt in ((held_out_model[0], ROWS, True), (excluding_model, TRAIN.stop, False)):
-        found = version(api, model)
-        assert found["fit"]["samples_given"] == rows
-        assert (found["lineage"]["holdout"]["learnt"], found["lineage"]["holdout"]["judged_rows"]) == (
-            learnt,
-            TRAIN.stop,
-        )
-    result = load_split(api, dataset, share=0.3)
-    assert row_indices(recording(), result.samples) == list(range(ROWS))[TRAIN]
-    assert row_indices(recording(), held_out(result)) == list(range(ROWS))[HELD_OUT]
+def test_split_leaves_a_guard_at_the_boundary(api, dataset):
+    learnt, held, _ = load_split(api, dataset, share=0.3)
+    assert row_indices(recording(), learnt) == list(range(ROWS))[TRAIN]
+    assert row_indices(recording(), held) == list(range(ROWS))[HELD_OUT]
 
 
-def test_lineage_keeps_the_split_and_the_scores(api, held_out_model, dataset):
-    reply = version(api, held_out_model[0])["lineage"]["holdout"]
-    (entry,) = reply["datasets"]
-    assert reply["split"] == held_out_model[1]["holdout"]
-    assert (reply["rows"], reply["guarded"], reply["samples"], reply["of"]) == (34, 4, 34, 34)
-    assert (entry["id"], entry["whole"], entry["rows"], entry["guarded"]) == (dataset, False, 34, 4)
-    assert (entry["guard"], entry["guard_unit"]) == (0.25, "s")
-
-
-def test_scores_are_of_a_model_without_the_held_out_rows(api, held_out_model, excluding_model):
+@both_models
+def test_version_is_judged_without_the_held_out_rows_and_may_then_learn_them(api, jobs, dataset, model, learnt):
+    found, split = version_of(api, model), jobs[model]["holdout"]
+    only = {} if learnt else {"only": True}
+    assert split == {"kind": "auto", "share": 0.3, "blocks": 10, "guard_s": None, "seed": 0} | only
+    assert found["fit"]["samples_given"] == (ROWS if learnt else TRAIN.stop)
+    record = found["lineage"]["holdout"]
+    assert (record["split"], record["learnt"], record["judged_rows"]) == (split, learnt, TRAIN.stop)
+    assert (record["rows"], record["guarded"], record["samples"], record["of"]) == (34, 4, 34, 34)
+    (entry,) = record["datasets"]
+    assert {**entry, **ENTRY, "id": dataset, "sha256": entry["sha256"]} == entry
     service, unseen = service_of(api), recording().rows(HELD_OUT)
-    model = lipcore.load(service.files.version_folder(registry.find(service.database, excluding_model, 1).folder))
-    metrics = evaluate(unseen.tau, *model.predict(unseen.q, unseen.dq, unseen.ddq).interval)
-    for each in (held_out_model[0], excluding_model):
-        reply = version(api, each)["lineage"]["holdout"]
-        for name in FIGURES:
-            np.testing.assert_allclose(reply[name], getattr(metrics, name), rtol=1e-6)
+    judged = lipcore.load(service.files.version_folder(registry.find(service.database, "kept-out", 1).folder))
+    assert_figures(record, vars(evaluate(unseen.tau, *judged.predict(unseen.q, unseen.dq, unseen.ddq).interval)))
 
 
-@pytest.mark.parametrize("model", ["held-out", "kept-out"])
-def test_evaluation_finds_the_held_out_rows_again(api, held_out_model, excluding_model, dataset, model):
-    reply, answer = (
-        version(api, model)["lineage"]["holdout"],
-        post_evaluation(api, model, dataset, part="held_out").json(),
-    )
-    assert [answer[name] for name in ("part", "samples", "samples_used", "in_training")] == ["held_out", 34, 34, False]
-    assert answer["judged"] is (model == "held-out")
-    for name in FIGURES:
-        np.testing.assert_allclose(answer[name], reply[name], rtol=1e-6)
-    answer = post_evaluation(api, model, dataset).json()
-    assert (answer["part"], answer["samples"], answer["in_training"], answer["judged"]) == ("all", ROWS, True, False)
+@both_models
+def test_evaluation_and_trace_find_the_held_out_rows_again(api, jobs, dataset, model, learnt):
+    fields = ("part", "samples", "samples_used", "in_training", "judged")
+    part, entire = (evaluation(api, model, dataset, **choice) for choice in ({"part": "held_out"}, {}))
+    assert [part[name] for name in fields] == ["held_out", 34, 34, False, learnt]
+    assert_figures(part, record_of(api, model))
+    assert [entire[name] for name in fields] == ["all", ROWS, ROWS, True, False]
+    traced = api.post(f"/v1/models/{model}/trace", json={"dataset": dataset, "part": "held_out"}).json()
+    assert (traced["samples"], traced["in_training"]) == (34, learnt)
 
 
-def test_evaluation_of_the_judged_fit_is_complete(api, held_out_model, excluding_model, dataset):
-    judged, computed = (
-        post_evaluation(api, model, dataset, part="held_out").json() for model in ("held-out", "kept-out")
-    )
-    for name in computed.keys() - {"model", "judged"}:
-        if name in ("coverages", "reliability", "stretches"):
+def test_evaluation_of_the_judged_fit_is_complete(api, jobs, dataset):
+    judged, computed = (evaluation(api, model, dataset, part="held_out") for model in jobs)
+    for name in computed.keys() - {"model", "judged", "joint_names", "warnings"}:
+        if isinstance(computed[name], list) or name in ("reliability", "stretches"):
             np.testing.assert_allclose(json_numbers(judged[name]), json_numbers(computed[name]), rtol=1e-6)
-        elif isinstance(computed[name], list) and name not in ("joint_names", "warnings"):
-            np.testing.assert_allclose(judged[name], computed[name], rtol=1e-6)
         else:
             assert judged[name] == computed[name], name
-
-
-def test_trace_of_held_out_rows_says_if_they_were_learnt(api, held_out_model, excluding_model, dataset):
-    for model, learnt in ((held_out_model[0], True), (excluding_model, False)):
-        answer = api.post(f"/v1/models/{model}/trace", json={"dataset": dataset, "part": "held_out"}).json()
-        assert (answer["samples"], answer["in_training"]) == (34, learnt)
+    assert [judged[name] for name in ("joint_names", "warnings")] == [computed["joint_names"], computed["warnings"]]
 
 
 def resting_joint_recording():
@@ -177,100 +149,84 @@ def resting_joint_recording():
 
 @pytest.mark.slow
 def test_version_learns_motion_that_only_held_out_rows_have(api):
-    dataset, other = (
-        upload(api, each)["id"] for each in (resting_joint_recording(), stream(samples=60, rate=10.0, seed=12))
-    )
+    dataset = upload(api, resting_joint_recording())["id"]
+    other = upload(api, stream(samples=60, rate=10.0, seed=12))["id"]
     errors = {}
     for model, only in (("moves-late", False), ("never-moves", True)):
         train(api, model, dataset, holdout={"kind": "last", "share": 0.3, "only": only})
-        errors[model] = post_evaluation(api, model, other).json()["nmse"]
+        errors[model] = evaluation(api, model, other)["nmse"]
     assert max(errors["moves-late"]) < 0.1 * max(errors["never-moves"])
-    reply = [version(api, model)["lineage"]["holdout"]["nmse"] for model in errors]
-    np.testing.assert_allclose(*reply, rtol=1e-6)
+    np.testing.assert_allclose(*(record_of(api, model)["nmse"] for model in errors), rtol=1e-6)
 
 
-def test_failed_fit_on_all_rows_keeps_the_judged_model(api, dataset, monkeypatch):
-    service = service_of(api)
-    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
-
-    def fails(model, task):
-        raise NotPositiveDefiniteError("the matrix is\nsingular")
-
-    monkeypatch.setattr(planned_fit, "refit", fails)
-    name = queue(api, "fails-late", dataset, holdout={"share": 0.3})["id"]
-    worker.run(service.settings, name)
-    assert ended(api, name)["state"] == "succeeded"
-    found = version(api, "fails-late")
-    assert found["fit"]["samples_given"] == TRAIN.stop
-    assert found["lineage"]["holdout"]["learnt"] is False
+def test_failed_fit_on_all_rows_keeps_the_judged_model(api, dataset, run_here, monkeypatch):
+    failure = NotPositiveDefiniteError("the matrix is\nsingular")
+    monkeypatch.setattr(planned_fit, "refit", Mock(side_effect=failure))
+    assert run_here(queue(api, "fails-late", dataset, holdout={"share": 0.3})["id"])["state"] == "succeeded"
+    found = version_of(api, "fails-late")
+    assert (found["fit"]["samples_given"], found["lineage"]["holdout"]["learnt"]) == (TRAIN.stop, False)
     assert found["warnings"][0] == (
         "The final fit, on all rows, failed (NotPositiveDefiniteError: the matrix is singular). "
         "The model has not learnt the held-out rows."
     )
-    answer = post_evaluation(api, "fails-late", dataset, part="held_out").json()
+    answer = evaluation(api, "fails-late", dataset, part="held_out")
     assert (answer["judged"], answer["in_training"]) == (False, False)
 
 
-def test_equal_samples_uploaded_again_split_alike(api, held_out_model, dataset):
+def test_equal_samples_uploaded_again_split_alike(api, jobs, dataset):
     again = upload(api, recording(), name="again")["id"]
-    answer = post_evaluation(api, held_out_model[0], again, part="held_out").json()
+    answer = evaluation(api, "held-out", again, part="held_out")
     assert (answer["samples"], answer["in_training"]) == (34, False)
-    assert post_evaluation(api, held_out_model[0], again).json()["in_training"] is True
+    assert evaluation(api, "held-out", again)["in_training"] is True
     body = {"model": "m", "datasets": [dataset, again], "holdout": {}}  # otherwise equal samples would be in both parts
-    problem = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
-    assert problem["detail"][0]["field"] == "datasets[1]"
+    assert_invalid(api.post("/v1/jobs", json=body), "datasets[1]")
 
 
-def test_samples_that_were_not_held_out_are_rejected(api, held_out_model, trained):
+def test_samples_that_were_not_held_out_are_rejected(api, jobs, trained):
     other = upload(api, recording(seed=9))["id"]
-    for model in (held_out_model[0], trained.name):
-        reply = error(post_evaluation(api, model, other, part="held_out"), 422, "invalid_request")
-        assert reply["detail"][0]["field"] == "part"
-        assert f"version 1 has no held-out rows of data set {other}" in reply["message"]
-    assert (
-        error(post_evaluation(api, held_out_model[0], other, part="most"), 422, "invalid_request")["detail"][0]["field"]
-        == "part"
-    )
+    missing = f"version 1 has no held-out rows of data set {other}"
+    for model, part, message in (
+        ("held-out", "held_out", missing),
+        (trained.name, "held_out", missing),
+        ("held-out", "most", ""),
+    ):
+        assert_invalid(post_evaluation(api, model, other, part=part), "part", message)
 
 
 @pytest.mark.slow
 def test_whole_data_sets_are_held_out_like_episodes(api):
-    lengths = (40, 60, 80, 50)
-    recorded_ = [stream(samples=length, rate=10.0, seed=20 + length) for length in lengths]
-    names = [upload(api, each)["id"] for each in recorded_]
-    train(api, "whole-sets", *names, holdout={"kind": "episodes", "share": 0.3})
-    reply = version(api, "whole-sets")["lineage"]["holdout"]
-    held = [each["id"] for each in reply["datasets"]]
+    lengths = {}
+    for length in (40, 60, 80, 50):
+        lengths[upload(api, stream(samples=length, rate=10.0, seed=20 + length))["id"]] = length
+    train(api, "whole-sets", *lengths, holdout={"kind": "episodes", "share": 0.3})
+    found = version_of(api, "whole-sets")
+    record = found["lineage"]["holdout"]
+    held = {each["id"] for each in record["datasets"]}
     assert 0 < len(held) < 4
-    assert all(each["whole"] for each in reply["datasets"])
-    assert reply["rows"] == sum(length for name, length in zip(names, lengths, strict=True) if name in held)
-    assert reply["guarded"] == 0
-    assert reply["judged_rows"] == sum(lengths) - reply["rows"]
-    assert version(api, "whole-sets")["fit"]["samples_given"] == sum(lengths)
-    for name, length in zip(names, lengths, strict=True):
-        answer = post_evaluation(api, "whole-sets", name).json()
-        assert (answer["samples"], answer["in_training"]) == (length, True)
-        part = post_evaluation(api, "whole-sets", name, part="held_out")
+    assert all(each["whole"] for each in record["datasets"])
+    assert (record["rows"], record["guarded"]) == (sum(lengths[name] for name in held), 0)
+    assert record["judged_rows"] == sum(lengths.values()) - record["rows"]
+    assert found["fit"]["samples_given"] == sum(lengths.values())
+    for name, length in lengths.items():
+        entire, part = evaluation(api, "whole-sets", name), post_evaluation(api, "whole-sets", name, part="held_out")
+        assert (entire["samples"], entire["in_training"]) == (length, True)
         assert part.status_code == (200 if name in held else 422)
-        if name in held:
-            assert (part.json()["samples"], part.json()["judged"]) == (length, True)
-
-    result = load_split(api, *reversed(names), kind="episodes", share=0.3)
-    assert {each["id"] for each in result.lineage["holdout"]["datasets"]} == set(held)
+        assert name not in held or (part.json()["samples"], part.json()["judged"]) == (length, True)
+    _, _, record = load_split(api, *reversed(lengths), kind="episodes", share=0.3)
+    assert {each["id"] for each in record["datasets"]} == held
 
 
 def test_data_set_without_times_has_a_guard_in_rows(api):
-    table = columns(recording(seed=4))
+    table, samples = columns(recording(seed=4)), recording(seed=4)
     del table["t"]
     untimed = post(api, csv(table), "text/csv", joint_names="joint1,joint2").json()["id"]
-    result = load_split(api, untimed, share=0.5)
-    (entry,) = result.lineage["holdout"]["datasets"]
+    learnt, held, record = load_split(api, untimed, share=0.5)
+    (entry,) = record["datasets"]
     assert (entry["guard"], entry["guard_unit"]) == (25.0, "rows")
-    assert row_indices(recording(seed=4), result.samples) == list(range(35))
-    assert row_indices(recording(seed=4), held_out(result)) == list(range(85, ROWS))
+    assert row_indices(samples, learnt) == list(range(35))
+    assert row_indices(samples, held) == list(range(85, ROWS))
     body = {"model": "m", "datasets": [untimed], "holdout": {"guard_s": 0.1}}
-    reply = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
-    assert reply["detail"][0]["field"] == "holdout.guard_s"
+    assert_invalid(api.post("/v1/jobs", json=body), "holdout.guard_s")
 
 
 @pytest.mark.parametrize(
@@ -285,43 +241,31 @@ def test_data_set_without_times_has_a_guard_in_rows(api):
         ({"kind": "stretches"}, "holdout.stretches", "required if `holdout.kind` is stretches"),
         ({"stretches": {"ds_1": [[0, 9]]}}, "holdout.stretches", "not allowed otherwise"),
         ({"kind": "stretches", "stretches": {"ds_1": [[0, 9]]}}, "holdout.stretches.ds_1", "one of the data sets"),
-    ],
-)
-def test_wrong_holdout_is_rejected(api, dataset, holdout, field, message):
-    body = {"model": "m", "datasets": [dataset], "options": QUICK, "holdout": holdout}
-    reply = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
-    assert reply["detail"][0]["field"] == field
-    assert message in reply["message"]
-
-
-@pytest.mark.parametrize(
-    ("stretches", "field", "message"),
-    [
         ([[9, 9]], "holdout.stretches.{}", "first < last and last at most 120"),
         ([[50, 60], [40, 45]], "holdout.stretches.{}", "in increasing order"),
         ([[50, 121]], "holdout.stretches.{}", "at most 120"),
         ([[0, 100]], "holdout.stretches", "it leaves 20 samples"),
     ],
+    ids=str,
 )
-def test_wrong_holdout_range_is_rejected(api, dataset, stretches, field, message):
-    holdout = {"kind": "stretches", "stretches": {dataset: stretches}}
+def test_wrong_holdout_is_rejected(api, dataset, holdout, field, message):
+    """A list stands for stretches of the data set."""
+    if isinstance(holdout, list):
+        holdout = {"kind": "stretches", "stretches": {dataset: holdout}}
     body = {"model": "m", "datasets": [dataset], "options": QUICK, "holdout": holdout}
-    reply = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
-    assert reply["detail"][0]["field"] == field.format(dataset)
-    assert message in reply["message"]
+    assert_invalid(api.post("/v1/jobs", json=body), field.format(dataset), message)
 
 
 def test_named_rows_are_held_out_and_found_again(api, dataset):
     other = upload(api, recording(seed=7))["id"]
     holdout = {"kind": "stretches", "stretches": {dataset: [[30, 60], [100, 110]]}}
-    result = load_split(api, dataset, other, **holdout)
-    assert row_indices(recording(), held_out(result)) == [*range(32, 58), *range(102, 108)]
-    assert len(result.samples.t) == ROWS - 32 - 4 * 4 + ROWS
+    learnt, held, _ = load_split(api, dataset, other, **holdout)
+    assert row_indices(recording(), held) == [*range(32, 58), *range(102, 108)]
+    assert len(learnt.t) == ROWS - 32 - 4 * 4 + ROWS
     job = train(api, "named-rows", dataset, other, holdout=holdout)
     assert job["holdout"]["stretches"] == holdout["stretches"]
-    answer = post_evaluation(api, "named-rows", dataset, part="held_out").json()
-    assert answer["samples"] == 32
-    assert answer["in_training"] is False
+    answer = evaluation(api, "named-rows", dataset, part="held_out")
+    assert (answer["samples"], answer["in_training"]) == (32, False)
 
 
 def test_split_without_training_rows_fails_the_job(api, dataset):
@@ -335,37 +279,30 @@ def test_split_without_training_rows_fails_the_job(api, dataset):
 def test_refresh_holds_out_the_same_samples(api):
     dataset = upload(api, recording(seed=6))["id"]
     train(api, "refreshed-held", dataset, holdout={"kind": "blocks", "share": 0.3, "blocks": 5})
-    before = version(api, "refreshed-held")
-    answer = api.post("/v1/models/refreshed-held/refresh", json={})
-    assert answer.status_code == 202, answer.text
-    seen = ended(api, answer.json()["id"])
-    assert seen["state"] == "succeeded", seen
-    after = version(api, "refreshed-held", 2)
+    seen = refresh(api, "refreshed-held")
+    before, after = (version_of(api, "refreshed-held", number) for number in (1, 2))
     for name in ("split", "datasets", "rows", "guarded", "judged_rows"):
         assert after["lineage"]["holdout"][name] == before["lineage"]["holdout"][name]
     assert after["fit"]["samples_given"] == before["fit"]["samples_given"] == ROWS
     compared = after["lineage"]["refresh"]["compared"]
     assert compared == "not compared with version 1, because too few rows are logged"
     assert seen["history"][-1]["message"] == f"version 2 is trained and is dismissed: {compared}"
-    answer = post_evaluation(api, "refreshed-held", dataset, part="held_out", version=2).json()
+    answer = evaluation(api, "refreshed-held", dataset, part="held_out", version=2)
     np.testing.assert_allclose(answer["nmse"], after["lineage"]["holdout"]["nmse"], rtol=1e-6)
     assert answer["in_training"] is False
 
 
 def test_refresh_excludes_what_its_version_never_learns(api):
-    dataset = upload(api, recording(seed=13))["id"]
-    train(api, "refreshed-kept", dataset, holdout={"share": 0.3, "only": True})
-    seen = ended(api, api.post("/v1/models/refreshed-kept/refresh", json={}).json()["id"])
-    assert seen["state"] == "succeeded", seen
-    after = version(api, "refreshed-kept", 2)
+    train(api, "refreshed-kept", upload(api, recording(seed=13))["id"], holdout={"share": 0.3, "only": True})
+    refresh(api, "refreshed-kept")
+    after = version_of(api, "refreshed-kept", 2)
     assert (after["fit"]["samples_given"], after["lineage"]["holdout"]["learnt"]) == (TRAIN.stop, False)
 
 
-def test_exported_version_includes_its_split(api, held_out_model, dataset):
-    answer = import_archive(api, exported(api, held_out_model[0]), name="came")
-    assert answer.status_code == 201, answer.text
-    assert answer.json()["lineage"]["holdout"] == version(api, held_out_model[0])["lineage"]["holdout"]
-    assert post_evaluation(api, "came", dataset, part="held_out").json()["samples"] == 34
+def test_exported_version_includes_its_split(api, jobs, dataset):
+    version = imported(api, exported(api, "held-out"), name="came")
+    assert version["lineage"]["holdout"] == record_of(api, "held-out")
+    assert evaluation(api, "came", dataset, part="held_out")["samples"] == 34
 
 
 def test_guard_is_a_period_of_the_low_pass(api):
@@ -373,13 +310,13 @@ def test_guard_is_a_period_of_the_low_pass(api):
     fine: Samples = stream(samples=400, rate=50.0, seed=8)
     answer = post(api, npz(**arrays(fine, "t", "q", "tau"), joint_names=np.array(fine.joint_names)), cutoff=2)
     assert answer.status_code == 201, answer.text
-    service, name = service_of(api), answer.json()["id"]
-    with service.database.transaction() as session:
+    name = answer.json()["id"]
+    with service_of(api).database.transaction() as session:
         row = session.query(DatasetRow).filter_by(id=name).one()
         row.report = {**row.report, "recipe": {"cutoff_hz": 2.0}}
-    result = load_split(api, name, share=0.3)
-    assert result.lineage["holdout"]["datasets"][0]["guard"] == 0.5
-    assert held_out(result).t[0] - result.samples.t[-1] > 1.0
+    learnt, held, record = load_split(api, name, share=0.3)
+    assert record["datasets"][0]["guard"] == 0.5
+    assert held.t[0] - learnt.t[-1] > 1.0
 
 
 def periodic(rows=600, seed=1):
@@ -389,29 +326,20 @@ def periodic(rows=600, seed=1):
 
 def test_held_out_rows_that_repeat_training_are_reported_with_period(api):
     """The lineage reports it for held-out rows, an evaluation also for other recordings that repeat."""
-    dataset = upload(api, periodic())["id"]
+    dataset, again, other = (upload(api, each)["id"] for each in (periodic(), periodic(rows=200), recording(seed=3)))
     train(api, "periodic", dataset, holdout={"kind": "last", "share": 0.3})
-    reply = version(api, "periodic")["lineage"]["holdout"]
-    assert reply["datasets"][0]["stretches"] is None
-    assert reply["repeats_training"] > 0.9
-    assert reply["period_s"] == pytest.approx(5.0, rel=0.02)
-    assert "repeat motion of the training, which repeats every 5 s" in reply["warnings"][0]
-    held, again, other = (
-        post_evaluation(api, "periodic", name, **part).json()
-        for name, part in (
-            (dataset, {"part": "held_out"}),
-            (upload(api, periodic(rows=200))["id"], {}),
-            (upload(api, recording(seed=3))["id"], {}),
-        )
-    )
-    assert {name: held[name] for name in ("repeats_training", "period_s", "warnings")} == {
-        name: reply[name] for name in ("repeats_training", "period_s", "warnings")
-    }
-    assert again["repeats_training"] > 0.9
-    assert other["repeats_training"] < 0.3
-    assert other["warnings"] == []
-    inside = post_evaluation(api, "periodic", dataset).json()
+    record = record_of(api, "periodic")
+    assert record["datasets"][0]["stretches"] is None
+    assert record["repeats_training"] > 0.9
+    assert record["period_s"] == pytest.approx(5.0, rel=0.02)
+    assert "repeat motion of the training, which repeats every 5 s" in record["warnings"][0]
+    held, inside = (evaluation(api, "periodic", dataset, part=part) for part in ("held_out", "all"))
+    assert [held[name] for name in REPETITION] == [record[name] for name in REPETITION]
     assert (inside["in_training"], inside["repeats_training"], inside["warnings"]) == (True, None, [])
+    assert evaluation(api, "periodic", again)["repeats_training"] > 0.9
+    answer = evaluation(api, "periodic", other)
+    assert answer["repeats_training"] < 0.3
+    assert answer["warnings"] == []
 
 
 def test_automatic_split_holds_out_a_part_without_repetition(api):
@@ -421,36 +349,30 @@ def test_automatic_split_holds_out_a_part_without_repetition(api):
     both = {name: np.concatenate([getattr(each, name) for each in (free, again)]) for name in names}
     samples = Samples(free.joint_names, np.arange(700) / 20.0, np.zeros(700, np.int64), **both)
     dataset = upload(api, samples)["id"]
-    result = load_split(api, dataset, share=0.3)
-    (entry,) = result.lineage["holdout"]["datasets"]
-    ((first, last),) = entry["stretches"]
+    _, held, record = load_split(api, dataset, share=0.3)
+    ((first, last),) = record["datasets"][0]["stretches"]
     assert first == 0
     assert last == pytest.approx(200, abs=100)  # a period
-    assert row_indices(samples, held_out(result)) == list(range(last - 5))  # a quarter of a second of guard
-    split = find_earlier_split(DatasetRow(id=dataset, sha256="?"), result.lineage)
+    assert row_indices(samples, held) == list(range(last - 5))  # a quarter of a second of guard
+    split = find_earlier_split(DatasetRow(id=dataset, sha256="?"), {"holdout": record})
     assert np.flatnonzero(split.held_out(samples.episode, samples.t)).tolist() == list(range(last - 5))
-    assert load_split(api, dataset, share=0.3, kind="last").lineage["holdout"]["datasets"][0]["stretches"] is None
-
-
-ENTRY = {"id": "ds_1", "sha256": "s", "whole": False, "guard": 0.25, "guard_unit": "s", "rows": 34, "guarded": 4}
-HOLDOUT = {"split": {"share": 0.3}, "datasets": [ENTRY], "rows": 34, "guarded": 4, "nmse": [0.1]}
-EPISODE, TIMES = np.zeros(120, dtype=np.int64), np.arange(120) / 10
+    _, _, record = load_split(api, dataset, share=0.3, kind="last")
+    assert record["datasets"][0]["stretches"] is None
 
 
 def test_lineage_names_the_data_preparation():
-    report = {"rows": 5, "recipe": {"cutoff_hz": 4.0}, "steps": [{"step": "trim", "text": "5 rows cut off"}]}
-    row = DatasetRow(id="ds_1", name="n", sha256="s", rows=5, report=report)
+    prepared = {"recipe": {"cutoff_hz": 4.0}, "steps": [{"step": "trim", "text": "5 rows cut off"}]}
     record = {"id": "ds_1", "name": "n", "sha256": "s", "rows": 5}
-    assert describe_datasets([row]) == [{**record, "recipe": report["recipe"], "steps": report["steps"]}]
-    assert describe_datasets([DatasetRow(id="ds_1", name="n", sha256="s", rows=5, report={"rows": 5})]) == [record]
+    for known in (prepared, {}):
+        assert describe_datasets([DatasetRow(**record, report={"rows": 5, **known})]) == [{**record, **known}]
 
 
 def test_data_sets_without_learnt_rows_are_not_in_training():
-    datasets = [{"id": "ds_1", "sha256": "s"}, {"id": "ds_2", "sha256": "r"}]
-    assert learnt_from({"datasets": datasets, "holdout": HOLDOUT}) == {"ds_1", "s", "ds_2", "r"}
+    lineage = {"datasets": [{"id": "ds_1", "sha256": "s"}, {"id": "ds_2", "sha256": "r"}], "holdout": HOLDOUT}
     entire = {**HOLDOUT, "datasets": [{**ENTRY, "whole": True}]}
-    assert learnt_from({"datasets": datasets, "holdout": entire}) == {"ds_2", "r"}
-    assert learnt_from({"datasets": datasets, "holdout": {**entire, "learnt": True}}) == {"ds_1", "s", "ds_2", "r"}
+    assert learnt_from(lineage) == {"ds_1", "s", "ds_2", "r"}
+    assert learnt_from({**lineage, "holdout": entire}) == {"ds_2", "r"}
+    assert learnt_from({**lineage, "holdout": {**entire, "learnt": True}}) == {"ds_1", "s", "ds_2", "r"}
     assert learnt_from({}) == frozenset()
 
 
@@ -474,10 +396,10 @@ def test_inconsistent_split_in_a_lineage_is_rejected(counts):
     "holdout",
     [
         {**HOLDOUT, "split": {"kind": "rows"}},
-        {**HOLDOUT, "datasets": [{**ENTRY, "guard": -1.0}]},
-        {**HOLDOUT, "datasets": [{**ENTRY, "rows": "3"}]},
-        {**HOLDOUT, "datasets": [{**ENTRY, "stretches": [[0, 3, 4]]}]},
-        {**HOLDOUT, "datasets": [{**ENTRY, "stretches": [[-1, 3]]}]},
+        *(
+            {**HOLDOUT, "datasets": [{**ENTRY, **wrong}]}
+            for wrong in ({"guard": -1.0}, {"rows": "3"}, {"stretches": [[0, 3, 4]]}, {"stretches": [[-1, 3]]})
+        ),
         3,
     ],
 )

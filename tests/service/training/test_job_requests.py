@@ -4,6 +4,7 @@ import pytest
 
 from lipcore.vocabulary import ESTIMATOR_CHOICES
 from tests.service.data import error, queue, stream, upload
+from tests.service.training.conftest import assert_invalid
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 40, "max_iterations": 4}
 
@@ -22,61 +23,40 @@ def datasets(no_worker):
     assert no_worker.get("/v1/jobs").json() == before
 
 
-def post_job(api, datasets, *names, **request):
-    ids = [datasets.get(name, name) for name in names or ["one"]]
-    return api.post("/v1/jobs", json={"model": "m", "datasets": ids, "options": QUICK, **request})
+def post_job(api, *datasets, **request):
+    return api.post("/v1/jobs", json={"model": "m", "datasets": datasets, "options": QUICK, **request})
 
 
 @pytest.mark.parametrize(
-    ("names", "field", "message"),
+    ("names", "request_", "field", "message"),
     [
-        (["one", "one"], "datasets[1]", "repeats data set"),
-        (["one", "two", "one"], "datasets", "at most 2"),
-        (["one", "other"], "datasets[1]", "`joint_names` of data set"),
-        (["compensated", "one"], "datasets[1]", "is gravity_included, that of"),
+        (["one", "one"], {}, "datasets[1]", "repeats data set"),
+        (["one", "two", "one"], {}, "datasets", "at most 2"),
+        (["one", "other"], {}, "datasets[1]", "`joint_names` of data set"),
+        (["compensated", "one"], {}, "datasets[1]", "is gravity_included, that of"),
+        (["one"], {"joint_types": ["revolute"]}, "joint_types", "1 entries; the data have 2 joints: joint1, joint2"),
+        (["one"], {"joint_types": []}, "joint_types", "0 entries"),
+        (["one"], {"joint_types": ["revolute", "screw"]}, "joint_types[1]", "'revolute' or 'prismatic'"),
+        (["one"], {"options": {**QUICK, "hyperparameter_samples": 31}}, "options.hyperparameter_samples", ""),
+        (["one"], {"options": {**QUICK, "posterior_samples": 41}}, "options.posterior_samples", ""),
+        (["one"], {"promotion": "never"}, "promotion", ""),
+        (["one"], {"promotion": True}, "promotion", ""),
     ],
 )
-def test_incompatible_data_sets_are_rejected(no_worker, datasets, names, field, message):
-    body = {"model": "m", "datasets": [datasets.get(name, name) for name in names], "options": QUICK}
-    reply = error(no_worker.post("/v1/jobs", json=body), 422, "invalid_request")
-    assert reply["detail"][0]["field"] == field
-    assert message in reply["message"]
+def test_invalid_request_is_rejected(no_worker, datasets, names, request_, field, message):
+    assert_invalid(post_job(no_worker, *(datasets[name] for name in names), **request_), field, message)
 
 
 def test_unknown_estimator_is_rejected_with_the_known_ones(no_worker, datasets):
-    reply = error(post_job(no_worker, datasets, estimator="magic"), 422, "invalid_request")
-    assert reply["detail"][0] == {
-        "field": "estimator",
-        "value": "magic",
-        "expected": f"one of {', '.join(ESTIMATOR_CHOICES)}",
-    }
-
-
-@pytest.mark.parametrize(
-    ("types", "field", "message"),
-    [
-        (["revolute"], "joint_types", "1 entries; the data have 2 joints: joint1, joint2"),
-        ([], "joint_types", "0 entries"),
-        (["revolute", "screw"], "joint_types[1]", "'revolute' or 'prismatic'"),
-    ],
-)
-def test_wrong_joint_types_are_rejected(no_worker, datasets, types, field, message):
-    reply = error(post_job(no_worker, datasets, joint_types=types), 422, "invalid_request")
-    assert reply["detail"][0]["field"] == field
-    assert message in reply["message"]
-
-
-@pytest.mark.parametrize(("name", "maximum"), [("hyperparameter_samples", 30), ("posterior_samples", 40)])
-def test_options_obey_the_limits_of_the_service(no_worker, datasets, name, maximum):
-    problem = error(post_job(no_worker, datasets, options=QUICK | {name: maximum + 1}), 422, "invalid_request")
-    assert problem["detail"][0]["field"] == f"options.{name}"
+    reply = error(post_job(no_worker, datasets["one"], estimator="magic"), 422, "invalid_request")
+    expected = f"one of {', '.join(ESTIMATOR_CHOICES)}"
+    assert reply["detail"][0] == {"field": "estimator", "value": "magic", "expected": expected}
 
 
 def test_full_queue_is_reported(no_worker):
     dataset = upload(no_worker, stream())["id"]
     waiting = [queue(no_worker, "m", dataset, options=QUICK)["id"] for _ in range(2)]
-    body = {"model": "m", "datasets": [dataset], "options": QUICK}
-    assert "2 waiting jobs" in error(no_worker.post("/v1/jobs", json=body), 429, "busy")["message"]
+    assert "2 waiting jobs" in error(post_job(no_worker, dataset), 429, "busy")["message"]
 
     no_worker.post(f"/v1/jobs/{waiting[0]}/cancel")
     waiting.append(queue(no_worker, "m", dataset, options=QUICK)["id"])

@@ -1,98 +1,66 @@
 """When a training process is ended and what becomes of its job, decided from rows and a clock without processes."""
 
 import pytest
-from sqlalchemy import select
 
 from service.foundation.settings import Settings
-from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import lifecycle
-from service.training.lifecycle import LIMITS, JobEnd, JobOutcome, JobStatus, Settler, WatchedJob
+from service.training.lifecycle import JobEnd, JobOutcome, JobStatus, Settler, WatchedJob
 from tests.service.training.conftest import new_row
 
 SETTINGS = Settings(max_job_s=1000.0)
 
 
-def watched_job():
-    return WatchedJob("job_x", slot=None, future=None, since=100.0)
-
-
-def status(state="running", heartbeat="a", cancel=False):
-    return JobStatus(state, heartbeat, cancel)
-
-
-def verdict(given, clock):
+def verdict(looks, clock, stopped=None):
+    """Return why a job watched since 100 s is ended at a time; looks: time and status of each look at its row."""
+    given = WatchedJob("job_x", slot=None, future=None, since=100.0)
+    for time, status in looks:
+        given.see(status, time)
+    if stopped is not None:
+        given.stop(stopped)
     found = given.judge(SETTINGS, clock)
     return None if found is None else found.why
 
 
-def test_process_may_take_its_time_to_start():
-    given = watched_job()
-    given.see(status("queued", None), 150.0)
-    assert verdict(given, 219.9) is None
-    assert verdict(given, 220.0) == "not_started"
+def running(heartbeat="a", cancel=False):
+    return JobStatus("running", heartbeat, cancel)
 
 
-def test_change_of_the_heartbeat_counts_not_its_value():
-    """Clocks of rows may be changed and machines sleep, so only a changed heartbeat matters."""
-    given = watched_job()
-    for beat in range(5):
-        clock = 101.0 + 50 * beat
-        given.see(status(heartbeat=f"1970-01-01T00:00:0{beat}"), clock)
-        assert verdict(given, clock + 49) is None
-    given.see(status(heartbeat="1970-01-01T00:00:04"), 340.0)
-    assert verdict(given, 360.9) is None
-    assert verdict(given, 361.0) == "silent"
+CANCELS = [(101.0, running("a")), (110.0, running("b", True)), (110.9, running("c", True))]
+"""The time to obey counts from the first."""
+BEATS = [(101.0 + 50 * beat, running(f"1970-01-01T00:00:0{beat}")) for beat in range(5)]
+"""Clocks of rows may be changed and machines sleep, so only a changed heartbeat matters."""
+UNTIL_1101_S = [(float(clock), running(str(clock))) for clock in range(101, 1102, 50)]
 
 
-def test_time_to_obey_a_cancel_counts_from_its_detection():
-    given = watched_job()
-    given.see(status(), 101.0)
-    given.see(status(heartbeat="b", cancel=True), 110.0)
-    given.see(status(heartbeat="c", cancel=True), 110.9)
-    assert verdict(given, 110.99) is None
-    assert verdict(given, 111.0) == "cancelled"
+@pytest.mark.parametrize(
+    ("looks", "last_s", "end_s", "why"),
+    [
+        ([(150.0, JobStatus("queued", None, False))], 219.9, 220.0, "not_started"),
+        *((BEATS[:count], 50 * count + 100.0, 50 * count + 171.0, "silent") for count in range(1, 6)),
+        ([*BEATS, (340.0, BEATS[-1][1])], 360.9, 361.0, "silent"),
+        (CANCELS, 110.99, 111.0, "cancelled"),
+        (UNTIL_1101_S, 1100.9, 1101.0, "too_long"),
+        *(
+            ([(101.0, running()), (110.0, JobStatus(state, "a", True))], 119.9, 120.0, "lingering")
+            for state in ("succeeded", "failed", "cancelled")
+        ),
+    ],
+)
+def test_process_is_ended_at_its_limit(looks, last_s, end_s, why):
+    assert verdict(looks, last_s) is None
+    assert verdict(looks, end_s) == why
 
 
 def test_cancel_before_the_process_begins_ends_nothing():
     """The row of such a job is cancelled already, so the process would do nothing."""
-    given = watched_job()
-    given.stop(101.0)
-    assert verdict(given, 110.0) is None
+    assert verdict([], 110.0, stopped=101.0) is None
 
 
-def test_job_has_a_maximum_duration():
-    given = watched_job()
-    for clock in range(101, 1102, 50):
-        given.see(status(heartbeat=str(clock)), float(clock))
-    assert verdict(given, 1100.9) is None
-    assert verdict(given, 1101.0) == "too_long"
-
-
-@pytest.mark.parametrize("state", ["succeeded", "failed", "cancelled"])
-def test_process_that_continues_after_its_job_is_ended(state):
-    given = watched_job()
-    given.see(status(), 101.0)
-    given.see(status(state, cancel=True), 110.0)
-    assert verdict(given, 110.0 + LIMITS.linger_s - 0.1) is None
-    assert verdict(given, 110.0 + LIMITS.linger_s) == "lingering"
-
-
-@pytest.fixture
-def store(home):
-    database = Database(home)
-    yield database, Files(home)
-    database.close()
-
-
-def settle(store, why="ended", message="the training process ended", **values):
+def settle(table, home, why="ended", message="the training process ended", **values):
     """Settle a job that has these values; return the outcome and the row."""
-    database, files = store
-    with database.transaction() as session:
-        session.add(new_row("x", **{"state": "running", "attempts": 1, **values}))
-    settled = Settler(database, files).settle(JobEnd("job_x", why, message))
-    with database.session() as session:
-        return settled, session.scalar(select(JobRow).where(JobRow.id == "job_x"))
+    job = table.add("x", **{"state": "running", "attempts": 1, **values})
+    return Settler(table.database, Files(home)).settle(JobEnd(job, why, message)), table.row(job)
 
 
 @pytest.mark.parametrize(
@@ -106,8 +74,8 @@ def settle(store, why="ended", message="the training process ended", **values):
         ({"why": "too_long", "cancel_requested": True}, JobOutcome(), "cancelled", None),
     ],
 )
-def test_outcome_of_a_running_job(store, values, settled, state, code):
-    found, row = settle(store, **values)
+def test_outcome_of_a_running_job(table, home, values, settled, state, code):
+    found, row = settle(table, home, **values)
     assert (found, row.state, row.error and row.error["code"]) == (settled, state, code)
     last = row.history[-1]
     assert "the training process ended" in last["message"]
@@ -124,24 +92,23 @@ def test_outcome_of_a_running_job(store, values, settled, state, code):
         ({"why": "returned", "state": "queued"}, JobOutcome(again=True)),  # meanwhile, and no attempt is counted
     ],
 )
-def test_job_that_does_not_run_is_unchanged(store, values, settled):
-    found, row = settle(store, **values)
+def test_job_that_does_not_run_is_unchanged(table, home, values, settled):
+    found, row = settle(table, home, **values)
     assert (found, row.state, row.finished_at, row.history) == (settled, values["state"], values.get("finished_at"), [])
 
 
-def test_missing_job_has_no_outcome(store):
-    database, files = store
-    assert Settler(database, files).settle(JobEnd("job_y", "ended", "")) == JobOutcome()
+def test_missing_job_has_no_outcome(table, home):
+    assert Settler(table.database, Files(home)).settle(JobEnd("job_y", "ended", "")) == JobOutcome()
 
 
-def test_only_unpublished_files_of_a_job_are_deleted(store):
-    database, files = store
+def test_only_unpublished_files_of_a_job_are_deleted(table, home):
+    files = Files(home)
     own, others = lifecycle.new_folder("job_x1x"), lifecycle.new_folder("job_y2y")
     for name in (own, others, f".draft-{own}-abc", "mv_published"):
         (files.versions / name).mkdir()
-    assert lifecycle.remove_leftovers(database, files, "job_x1x") == 2
+    assert lifecycle.remove_leftovers(table.database, files, "job_x1x") == 2
     assert {path.name for path in files.versions.iterdir()} == {others, "mv_published"}
-    assert lifecycle.remove_leftovers(database, files, "job_x1x") == 0
+    assert lifecycle.remove_leftovers(table.database, files, "job_x1x") == 0
 
 
 def test_history_keeps_its_first_and_newest_entries():

@@ -13,9 +13,10 @@ from service.training.promotion import settle
 from tests.service.data import QUICK, ended, error, queue, service_of, stream, train, upload
 from tests.service.learning.learning_models import publish
 from tests.service.models.archives.packing import TAR, exported
+from tests.service.models.versions import predict, predict_json
+from tests.service.training.conftest import version_of
 
 ROWS, HELD = 120, {"share": 0.3}
-QUERY = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
 CUT = 84
 """The number of rows of a recording that are learnt."""
 
@@ -30,12 +31,13 @@ def upload_recording(api, seed, spoilt=None, amount=5.0):
     return upload(api, samples)["id"]
 
 
-def version(api, model, number):
-    return api.get(f"/v1/models/{model}/versions/{number}").json()
-
-
 def reason(api, model, number):
-    return version(api, model, number)["promotion"]["reason"]
+    return version_of(api, model, number)["promotion"]["reason"]
+
+
+def promotion(api, model, number):
+    found = version_of(api, model, number)["promotion"]
+    return found["answers"], found["passed"], found["serving"]
 
 
 @pytest.fixture(scope="module")
@@ -49,91 +51,74 @@ def judged_jobs(api):
     return jobs
 
 
-def promotion_of(api, number):
-    found = version(api, "judged", number)["promotion"]
-    return found["answers"], found["passed"], found["serving"]
-
-
 @pytest.mark.slow
 def test_version_without_held_out_data_serves_only_on_request(api, judged_jobs):
-    assert promotion_of(api, 1) == (True, None, None)
-    assert (
-        reason(api, "judged", 1)
-        == "not judged, because no rows were held out; it serves, because `promotion` is always"
-    )
-    train(api, "unjudged", upload_recording(api, 31), promotion="ask")
-    found = version(api, "unjudged", 1)["promotion"]
     why = "not judged, because no rows were held out"
-    assert (found["answers"], found["passed"], found["reason"]) == (False, None, why)
+    train(api, "unjudged", upload_recording(api, 31), promotion="ask")
+    assert promotion(api, "judged", 1) == (True, None, None)
+    assert reason(api, "judged", 1) == f"{why}; it serves, because `promotion` is always"
+    assert promotion(api, "unjudged", 1) == (False, None, None)
+    assert reason(api, "unjudged", 1) == why
 
 
-def test_version_with_too_narrow_intervals_is_a_candidate(api, judged_jobs):
-    assert promotion_of(api, 2) == (False, False, 1)
-    why = reason(api, "judged", 2)
-    assert "coverage of the 95 % intervals is below 90 %: joint1" in why
-    assert "effective samples" in why
-    assert judged_jobs[0]["history"][-1]["message"] == f"version 2 is trained and is a candidate: {why}"
-
-
-def test_version_that_predicts_worse_is_a_candidate(api, judged_jobs):
-    assert promotion_of(api, 3) == (False, False, 1)
-    assert "its predictions of the held-out rows are worse than those of version 1" in reason(api, "judged", 3)
-    assert min(version(api, "judged", 3)["lineage"]["holdout"]["coverage"]) > 0.9
-
-
-def test_version_serves_if_the_request_demands_it(api, judged_jobs):
+def test_version_that_fails_on_held_out_data_serves_only_if_the_request_demands_it(api, judged_jobs):
+    assert [promotion(api, "judged", number) for number in (2, 3, 4)] == [
+        (False, False, 1),
+        (False, False, 1),
+        (True, False, 1),
+    ]
+    narrow, worse, demanded = (reason(api, "judged", number) for number in (2, 3, 4))
+    assert "coverage of the 95 % intervals is below 90 %: joint1" in narrow
+    assert "effective samples" in narrow
+    assert judged_jobs[0]["history"][-1]["message"] == f"version 2 is trained and is a candidate: {narrow}"
+    assert "its predictions of the held-out rows are worse than those of version 1" in worse
+    assert min(version_of(api, "judged", 3)["lineage"]["holdout"]["coverage"]) > 0.9
     assert judged_jobs[2]["promotion"] == "always"
-    assert promotion_of(api, 4) == (True, False, 1)
-    assert reason(api, "judged", 4).endswith("it serves, because `promotion` is always")
+    assert demanded.endswith("it serves, because `promotion` is always")
 
 
 def test_newest_candidate_has_an_alias_and_can_be_promoted(api, judged_jobs):
     model = api.get("/v1/models/judged").json()
     assert (model["serving_version"], model["aliases"]) == (4, {"candidate": 3})
-    for selection, answers in (({}, 4), ({"alias": "candidate"}, 3)):
-        assert api.post("/v1/models/judged/predict", json=QUERY | selection).json()["version"] == answers
+    assert [predict_json(api, "judged", **chosen)["version"] for chosen in ({}, {"alias": "candidate"})] == [4, 3]
     with service_of(api).database.session() as session:
         roles = [session.get_one(LearnerRow, ("judged", number)).role for number in (2, 3)]
     assert roles == ["dismissed"] * 2  # the learner compares neither of them
 
     moved = api.put("/v1/models/judged/aliases/serving", json={"alias": "candidate"})
     assert moved.status_code == 200, moved.text
-    assert api.post("/v1/models/judged/predict", json=QUERY).json()["version"] == 3
-    assert promotion_of(api, 3) == (False, False, 1)  # recorded at the end of the training
-    problem = error(api.delete("/v1/models/judged/versions/3"), 409, "conflict")
-    assert "'candidate'" in problem["message"]
+    assert predict_json(api, "judged")["version"] == 3
+    assert promotion(api, "judged", 3) == (False, False, 1)  # recorded at the end of the training
+    assert "'candidate'" in error(api.delete("/v1/models/judged/versions/3"), 409, "conflict")["message"]
     assert api.delete("/v1/models/judged/versions/2").status_code == 204
 
 
 def test_model_has_no_serving_version_if_its_first_fails(api):
     train(api, "first-bad", upload_recording(api, 35, slice(CUT, None)), holdout=HELD, promotion="ask")
-    found = version(api, "first-bad", 1)["promotion"]
-    assert (found["answers"], found["passed"], found["serving"]) == (False, False, None)
+    assert promotion(api, "first-bad", 1) == (False, False, None)
     model = api.get("/v1/models/first-bad").json()
     assert (model["serving_version"], model["aliases"]) == (None, {"candidate": 1})
     assert [each["alias"] for each in api.get("/v1/models/first-bad/aliases").json()["items"]] == ["candidate"]
     shown = next(each for each in api.get("/v1/overview").json()["items"] if each["name"] == "first-bad")
     assert (shown["serving_version"], shown["candidate"]) == (None, 1)
 
-    where = "/v1/models/first-bad"
+    where, hint = "/v1/models/first-bad", "`lipserve models promote first-bad 1`"
     rows = {"t": [0.0], "q": [[0.1, 0.2]], "dq": [[0.0, 0.0]], "ddq": [[0.0, 0.0]], "tau": [[0.0, 0.0]]}
     for refused in (
-        api.post(f"{where}/predict", json=QUERY),
+        predict(api, "first-bad"),
         api.post(f"{where}/observations", json={"stream_id": "s", "sequence": 0, **rows}),
         api.get(f"{where}/export"),
-        api.post(f"{where}/aliases/serving/rollback", json={}),
     ):
-        code = "conflict" if "rollback" in str(refused.request.url) else "no_serving_version"
-        message = error(refused, 409, code)["message"]
-        assert code == "conflict" or "`lipserve models promote first-bad 1`" in message
+        assert hint in error(refused, 409, "no_serving_version")["message"]
+    error(api.post(f"{where}/aliases/serving/rollback", json={}), 409, "conflict")
     answer = api.post("/v2/models/first-bad/infer", json={"inputs": []})
     assert answer.status_code == 409
-    assert "`lipserve models promote first-bad 1`" in answer.json()["error"]
+    assert hint in answer.json()["error"]
 
     assert api.delete(f"{where}/aliases/candidate").status_code == 204
     assert "only version" in error(api.delete(f"{where}/versions/1"), 409, "conflict")["message"]
     assert api.put(f"{where}/aliases/serving", json={"version": 1}).status_code == 200
-    assert api.post(f"{where}/predict", json=QUERY).json()["version"] == 1
+    assert predict_json(api, "first-bad")["version"] == 1
 
 
 def test_motion_unrelated_to_the_torque_does_not_serve(api):
@@ -144,28 +129,25 @@ def test_motion_unrelated_to_the_torque_does_not_serve(api):
 
 
 def test_versions_of_a_model_have_one_robot(api):
+    difference = "its version 1 has joint_names joint1, joint2; this one has elbow, wrist"
     train(api, "kept", upload_recording(api, 41))
     other = stream(samples=ROWS, rate=10.0, seed=31)
     other = upload(api, replace(other, joint_names=("elbow", "wrist")))["id"]
-    body = {"model": "kept", "datasets": [other], "estimator": "lip-chain", "options": QUICK}
-    for path in ("/v1/jobs", "/v1/jobs/check"):
-        message = error(api.post(path, json=body), 409, "conflict")["message"]
-        assert "its version 1 has joint_names joint1, joint2; this one has elbow, wrist" in message
-
     train(api, "of-other", other)
-    archive = exported(api, "of-other")
-    message = error(api.post("/v1/models/import?name=kept", content=archive, headers=TAR), 409, "conflict")["message"]
-    assert "this one has elbow, wrist" in message
     service = service_of(api)
     with service.database.session() as session:
         folder = service.files.version_folder(session.get_one(VersionRow, ("of-other", 1)).folder)
     publish(service.database, service.files, folder, "kept", candidate=True)  # an earlier release allowed it
-    for move in (
+    body = {"model": "kept", "datasets": [other], "estimator": "lip-chain", "options": QUICK}
+    for refused in (
+        api.post("/v1/jobs", json=body),
+        api.post("/v1/jobs/check", json=body),
+        api.post("/v1/models/import?name=kept", content=exported(api, "of-other"), headers=TAR),
         api.put("/v1/models/kept/aliases/serving", json={"version": 2}),
         api.put("/v1/models/kept/aliases/spare", json={"version": 2}),
         api.post("/v1/models/kept/rollback", json={"version": 2}),
     ):
-        assert "this one has elbow, wrist" in error(move, 409, "conflict")["message"]
+        assert difference in error(refused, 409, "conflict")["message"]
     assert api.get("/v1/models/kept").json()["serving_version"] == 1
 
 
@@ -214,12 +196,6 @@ def test_version_is_a_candidate_if_the_serving_one_has_changed(api, judged_jobs)
         assert f"not compared with version {now}" in found.reason
         assert settle(session, "judged", good, "always") is good
         assert settle(session, "judged", good.model_copy(update={"serving": now}), "ask").answers
-
-
-@pytest.mark.parametrize("option", ["never", True])
-def test_other_promotion_options_are_rejected(api, option):
-    body = {"model": "m", "datasets": [upload_recording(api, 31)], "promotion": option}
-    assert error(api.post("/v1/jobs", json=body), 422, "invalid_request")["detail"][0]["field"] == "promotion"
 
 
 def test_retry_keeps_the_promotion_option(api):

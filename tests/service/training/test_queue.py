@@ -1,19 +1,21 @@
 """The job queue with processes that hang, die or ignore cancels: every job ends or is resumed."""
 
+from unittest.mock import Mock
+
 from service.storage import replicas
 from service.training import metrics, queue
 from service.training.lifecycle import JobLimits
 from tests.service.data import eventually
 from tests.service.server import command
 from tests.service.training import workers
-from tests.service.training.conftest import messages_of
+from tests.service.training.conftest import fail_at_first, messages_of
 
 
 def test_only_the_process_that_ignores_a_cancel_is_ended(start_queue):
     jobs = start_queue(workers.ignore_cancel, JobLimits(cancel_s=0.1), training_workers=2)
     stubborn, other = jobs.submit("stubborn"), jobs.submit("other")
     first, beside = jobs.running(stubborn), jobs.running(other)
-    jobs.cancel(stubborn)
+    jobs.change(stubborn, cancel_requested=True)
     seen = jobs.ended(stubborn)
     assert (seen.state, seen.version, seen.attempts) == ("cancelled", None, 1)
     assert "did not stop within 0.1 s" in messages_of(seen)[-1]
@@ -65,14 +67,8 @@ def test_job_whose_process_cannot_start_fails(start_queue):
 def test_job_waits_while_no_process_can_be_started(start_queue, monkeypatch):
     jobs = start_queue(workers.succeed, JobLimits(pause_s=0.05))
     (slot,) = jobs.queue._slots
-    start, refusals = slot.start, iter([OSError(11, "Resource temporarily unavailable")])
-
-    def fail_at_first(*given):
-        for refusal in refusals:
-            raise refusal
-        return start(*given)
-
-    monkeypatch.setattr(slot, "start", fail_at_first)
+    refusal = OSError(11, "Resource temporarily unavailable")
+    monkeypatch.setattr(slot, "start", fail_at_first(slot.start, refusal))
     seen = jobs.ended(jobs.submit("patient"))
     assert (seen.state, seen.attempts) == ("succeeded", 1)
     assert "temporarily unavailable: queued again" in messages_of(seen)[0]
@@ -82,14 +78,14 @@ def test_outcome_is_written_once_the_database_is_unlocked(start_queue, monkeypat
     """The job's process dies while another program locks the database for longer than the service waits."""
     monkeypatch.setattr(queue, "RETRY_S", 0.05)
     jobs = start_queue(workers.exit_in_first_attempt)
-    tried, settle = [], jobs.queue._settler.settle
-    monkeypatch.setattr(jobs.queue._settler, "settle", lambda ended: (tried.append(ended), settle(ended))[1])
+    settle = Mock(wraps=jobs.queue._settler.settle)
+    monkeypatch.setattr(jobs.queue._settler, "settle", settle)
     job = jobs.submit("frail")
     jobs.running(job)
     eventually(lambda: any((jobs.settings.home / "versions").iterdir()))
     with jobs.database.transaction():
         (jobs.settings.home / "die").touch()
-        eventually(lambda: len(tried) >= 2)
+        eventually(lambda: settle.call_count >= 2)
         assert jobs.row(job).state == "running"
     seen = jobs.ended(job)
     assert (seen.state, seen.attempts) == ("succeeded", 2)
@@ -123,19 +119,19 @@ def test_jobs_start_once_and_in_order(start_queue, monkeypatch):
     assert sorted(jobs.made) == [(f"number{number}", 1) for number in range(3)]
 
     monkeypatch.setattr(queue, "WATCH_S", 0.0)
-    reads = []  # an idle queue does not read the database
-    monkeypatch.setattr(jobs.queue.database, "session", lambda: reads.append(1))
+    read = Mock()  # an idle queue does not read the database
+    monkeypatch.setattr(jobs.queue.database, "session", read)
     for _ in range(5):
         jobs.queue._inbox.put(jobs.queue._look)
     eventually(jobs.queue._inbox.empty)
-    assert reads == []
+    assert not read.called
 
 
 def test_closing_queue_returns_its_jobs_and_keeps_cancels(start_queue):
     jobs = start_queue(workers.ignore_cancel, JobLimits(cancel_s=60.0), training_workers=2)
     back, unwanted = jobs.submit("back"), jobs.submit("unwanted")
     pids = [jobs.running(job).progress["process"] for job in (back, unwanted)]
-    jobs.cancel(unwanted)
+    jobs.change(unwanted, cancel_requested=True)
     jobs.queue.close()
     assert all(command(pid) == "" for pid in pids)
     seen = jobs.row(back)

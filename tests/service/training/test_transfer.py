@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from service.models import registry
-from tests.service.data import ended, error, job, queue, service_of, stream, train, upload
-from tests.service.models.archives.packing import exported, import_archive
+from tests.service.data import error, job, queue, service_of, stream, train, upload
+from tests.service.models.archives.packing import exported, imported
+from tests.service.training.conftest import refresh
 
 FIRST = "unit-1"
 
@@ -19,7 +20,7 @@ def second(api):
 @pytest.fixture
 def base_version(api):
     """The number of the first of two versions of the shipped Panda under another name; its alias is `old`."""
-    versions = [import_archive(api, exported(api, "panda-sim"), name=FIRST).json()["version"] for _ in range(2)]
+    versions = [imported(api, exported(api, "panda-sim"), name=FIRST)["version"] for _ in range(2)]
     api.put(f"/v1/models/{FIRST}/aliases/serving", json={"version": versions[1]})
     api.put(f"/v1/models/{FIRST}/aliases/old", json={"version": versions[0]})
     yield versions[0]
@@ -40,10 +41,13 @@ def test_version_trained_from_a_base_outlives_it(api, base_version, second):
     query = {name: getattr(unseen, name).tolist() for name in ("q", "dq", "ddq")}
     tau = np.array(api.post("/v1/models/unit-2/predict", json=query).json()["tau"])
     assert (np.mean((tau - unseen.tau) ** 2, axis=0) < 0.05 * unseen.tau.var(axis=0)).all()
-    again = ended(api, api.post("/v1/models/unit-2/refresh", json={}).json()["id"])
-    refreshed = api.get(f"/v1/models/unit-2/versions/{again['version']}").json()
+    refreshed = api.get(f"/v1/models/unit-2/versions/{refresh(api, 'unit-2')['version']}").json()
     assert refreshed["lineage"]["base"] == version["lineage"]["base"]
     assert refreshed["parameters"]["geometry"]["mode"] == "calibrate"
+
+
+def post_job(api, *datasets, **request):
+    return api.post("/v1/jobs", json={"model": "refused", "datasets": datasets, "base": "panda-sim:1", **request})
 
 
 @pytest.mark.parametrize(
@@ -64,20 +68,23 @@ def test_version_trained_from_a_base_outlives_it(api, base_version, second):
     ],
 )
 def test_unsuitable_base_is_rejected(api, trained, second, given, field, message):
-    body = {"model": "refused", "datasets": [second["id"]], "estimator": "rigid-body", "base": "panda-sim", **given}
-    reply = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
-    assert reply["detail"][0]["field"] == field
-    assert message in reply["detail"][0]["expected"]
+    request = {"estimator": "rigid-body", "base": "panda-sim", **given}
+    detail = error(post_job(api, second["id"], **request), 422, "invalid_request")["detail"][0]
+    assert detail["field"] == field
+    assert message in detail["expected"]
     error(api.get("/v1/models/refused"), 404, "not_found")
 
 
-@pytest.mark.parametrize(("what", "params"), [("joint_names", {}), ("torque_convention", {})])
-def test_base_of_other_data_is_rejected(api, pendulum, what, params):
-    dataset = pendulum
-    if what == "torque_convention":
-        dataset = upload(api, stream("panda", 60), torque_convention="gravity_compensated")
-    body = {"model": "refused", "datasets": [dataset["id"]], "base": "panda-sim:1"}
-    detail = error(api.post("/v1/jobs", json=body), 422, "invalid_request")["detail"][0]
+@pytest.mark.parametrize(
+    ("robot", "what", "convention"),
+    [
+        ("double-pendulum", "joint_names", "gravity_included"),
+        ("panda", "torque_convention", "gravity_compensated"),
+    ],
+)
+def test_base_of_other_data_is_rejected(api, robot, what, convention):
+    dataset = upload(api, stream(robot, 60), torque_convention=convention)
+    detail = error(post_job(api, dataset["id"]), 422, "invalid_request")["detail"][0]
     assert (detail["field"], detail["value"]) == ("base", "panda-sim:1")
     assert f"a version with the {what} of the data" in detail["expected"]
 
@@ -87,8 +94,7 @@ def test_base_of_other_data_is_rejected(api, pendulum, what, params):
     [("nobody", "no model 'nobody'"), ("panda-sim:99", "no version '99'"), ("panda-sim@none", "no alias 'none'")],
 )
 def test_missing_base_is_rejected(api, second, base, message):
-    body = {"model": "refused", "datasets": [second["id"]], "base": base}
-    assert message in error(api.post("/v1/jobs", json=body), 404, "not_found")["message"]
+    assert message in error(post_job(api, second["id"], base=base), 404, "not_found")["message"]
 
 
 def test_base_is_kept_while_a_job_waits_for_it(api, base_version, second, monkeypatch):

@@ -56,6 +56,15 @@ def pack_members(members: list[tuple[tarfile.TarInfo, bytes]], form: int = tarfi
     return file.getvalue()
 
 
+def with_first_header(archive: bytes, place: int, changed: bytes) -> bytes:
+    """Return a tar file with other bytes in its first header, and the checksum that matches."""
+    packed = bytearray(archive)
+    packed[place : place + len(changed)] = changed
+    packed[148:156] = b" " * 8
+    packed[148:156] = f"{sum(packed[:512]):06o}\0 ".encode()
+    return bytes(packed)
+
+
 def with_checksums(files: Mapping[str, bytes]) -> Files:
     """Return the members with correct checksums."""
     rest = {name: content for name, content in files.items() if name != "checksums.json"}
@@ -103,14 +112,26 @@ def import_archive(api: Any, archive: bytes, **params: Any) -> Any:
     return api.post("/v1/models/import", content=archive, headers=TAR, params=params)
 
 
-def assert_rejected(api: Any, archive: bytes, field: str, *words: str) -> None:
-    """Check that an archive is rejected with this field and these words, and that nothing of it is stored."""
+def imported(api: Any, archive: bytes, **params: Any) -> Any:
+    """Import an archive that must be accepted; return the version."""
+    answer = import_archive(api, archive, **params)
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+def rejected_field(api: Any, archive: bytes, *words: str) -> str:
+    """Check that an archive is rejected with these words, and that nothing of it is stored; return the field."""
     files = service_of(api).files
     before = sorted(files.versions.iterdir())
     body = error(import_archive(api, archive, name="refused"), 422, "invalid_data")
-    assert body["detail"][0]["field"] == field, body
     for word in words:
         assert word in body["message"], body
     assert api.get("/v1/models/refused").status_code == 404
     assert sorted(files.versions.iterdir()) == before
     assert list(files.uploads.iterdir()) == []
+    return body["detail"][0]["field"]
+
+
+def assert_rejected(api: Any, archive: bytes, field: str, *words: str) -> None:
+    """Check that an archive is rejected with this field and these words, and that nothing of it is stored."""
+    assert rejected_field(api, archive, *words) == field

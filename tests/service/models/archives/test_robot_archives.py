@@ -9,17 +9,18 @@ import pytest
 import lipcore
 from lipcore.files import persistence
 from lipcore.robots.urdf import RigidBody
-from tests.service.data import QUICK, stream
+from tests.service.data import QUICK, arrays, stream
 from tests.service.models.archives.packing import (
     MANIFEST,
     assert_rejected,
     exported,
-    import_archive,
+    imported,
     pack,
     unpack,
     with_checksums,
     with_json,
 )
+from tests.service.models.versions import predict_json
 
 ROBOT = "robot.urdf"
 TYPES = ["revolute", "revolute"]
@@ -33,8 +34,8 @@ def model():
 
 
 @pytest.fixture(scope="module")
-def files(api, trained, model):
-    about = unpack(exported(api, trained.name))["export.json"]
+def files(archive, model):
+    about = unpack(archive)["export.json"]
     return with_checksums({"export.json": about, **persistence.encode(model, {"made": "by a test"})[1]})
 
 
@@ -45,23 +46,21 @@ def with_urdf(files, urdf):
 
 
 def test_model_with_its_robot_is_exported_and_imported(api, files, model):
-    assert import_archive(api, pack(files), name="with-robot").status_code == 201
+    imported(api, pack(files), name="with-robot")
     out = unpack(exported(api, "with-robot", version=1))
     assert out[ROBOT] == files[ROBOT]
-    samples = stream(seed=12, samples=10)
-    body = {name: getattr(samples, name).tolist() for name in ("q", "dq", "ddq")}
-    answer = api.post("/v1/models/with-robot/predict", json=body | {"version": 1}).json()
-    assert np.array_equal(answer["tau"], model.predict(samples.q, samples.dq, samples.ddq).tau)
+    motion = arrays(stream(seed=12, samples=10), "q", "dq", "ddq")
+    answer = predict_json(api, "with-robot", **motion, version=1)
+    assert np.array_equal(answer["tau"], model.predict(**motion).tau)
 
 
 def test_parameters_are_recomputed(api, files):
-    def forge_parameters(manifest):
-        manifest["parameters"]["inertia"]["bodies"][0]["mean"]["mass"] = 1000.0
+    def first_body(manifest):
+        return manifest["parameters"]["inertia"]["bodies"][0]["mean"]
 
-    version = import_archive(api, pack(with_json(files, MANIFEST, forge_parameters)), name="lied").json()
-    record = json.loads(files[MANIFEST])["parameters"]["inertia"]["bodies"][0]["mean"]["mass"]
-    result = version["parameters"]["inertia"]["bodies"][0]["mean"]["mass"]
-    assert result == pytest.approx(record, rel=1e-6)
+    forged = with_json(files, MANIFEST, lambda manifest: first_body(manifest).update(mass=1000.0))
+    version = imported(api, pack(forged), name="lied")
+    assert first_body(version)["mass"] == pytest.approx(first_body(json.loads(files[MANIFEST]))["mass"], rel=1e-6)
 
 
 BOMB = b'<?xml version="1.0"?><!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><robot name="r">&b;</robot>'
@@ -75,9 +74,8 @@ URDFS = {
 }
 
 
-@pytest.mark.parametrize("attack", URDFS.values(), ids=URDFS)
-def test_wrong_urdf(api, files, attack):
-    urdf, reply = attack
+@pytest.mark.parametrize(("urdf", "reply"), URDFS.values(), ids=URDFS)
+def test_wrong_urdf(api, files, urdf, reply):
     assert_rejected(api, pack(with_urdf(files, urdf)), ROBOT, reply)
 
 

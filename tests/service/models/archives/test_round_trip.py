@@ -9,29 +9,17 @@ import numpy as np
 import pytest
 
 from service.models import lineage
-from tests.service.data import service_of, stream
+from tests.service.data import arrays, service_of, stream
 from tests.service.models.archives.packing import (
     MANIFEST,
     exported,
     import_archive,
+    imported,
     pack,
     unpack,
-    with_checksums,
     with_json,
 )
-
-
-@pytest.fixture(scope="module")
-def archive(api, trained):
-    return exported(api, trained.name)
-
-
-def post_query(api, model, **more):
-    samples = stream(seed=12, samples=15)
-    body = {name: getattr(samples, name).tolist() for name in ("q", "dq", "ddq")} | {"covariance": True, **more}
-    answer = api.post(f"/v1/models/{model}/predict", json=body)
-    assert answer.status_code == 200, answer.text
-    return answer.json()
+from tests.service.models.versions import predict_json
 
 
 def test_archive_describes_and_hashes_its_contents(api, trained, archive):
@@ -52,13 +40,14 @@ def test_imported_version_answers_alike_bit_for_bit(api, trained, archive):
     answer = import_archive(api, archive, name="taken-in")
     assert answer.status_code == 201, answer.text
     assert answer.headers["location"] == "/v1/models/taken-in/versions/1"
-    before, after = post_query(api, trained.name, version=1), post_query(api, "taken-in", version=1)
+    query = {**arrays(stream(seed=12, samples=15), "q", "dq", "ddq"), "covariance": True, "version": 1}
+    before, after = (predict_json(api, model, **query) for model in (trained.name, "taken-in"))
     for name in ("tau", "tau_std", "noise_std", "covariance"):
         assert before[name] == after[name]
 
 
 def test_imported_version_names_its_origin(api, trained, archive):
-    version = import_archive(api, archive, name="told").json()
+    version = imported(api, archive, name="told")
     original = api.get(f"/v1/models/{trained.name}/versions/1").json()
     origin = version["lineage"].pop("imported")
     assert version["lineage"] == original["lineage"]
@@ -66,44 +55,39 @@ def test_imported_version_names_its_origin(api, trained, archive):
     assert version["job"] is None
     for name in ("joint_names", "noise_std", "options", "fit", "compact", "calibration", "training_range"):
         assert version[name] == original[name]
-    again = import_archive(api, exported(api, "told", version=1), name="told").json()
+    again = imported(api, exported(api, "told", version=1), name="told")
     assert [each["model"] for each in again["lineage"]["imported"]] == [trained.name, "told"]
     assert again["version"] == 2
 
 
-def test_import_drops_the_signature_of_an_earlier_build(api, archive):
+def test_import_drops_the_signature_of_an_earlier_build(api, files):
     signature = b'{"algorithm": "ed25519", "signer": "ed25519:AAAA", "signature": "of something else"}'
-    answer = import_archive(api, pack({"signature.json": signature, **unpack(archive)}), name="signed")
-    assert answer.status_code == 201, answer.text
-    assert "signed_by" not in answer.json()["lineage"]["imported"][0]
-    assert set(unpack(exported(api, "signed", version=1))) == set(unpack(archive))
+    version = imported(api, pack({"signature.json": signature, **files}), name="signed")
+    assert "signed_by" not in version["lineage"]["imported"][0]
+    assert set(unpack(exported(api, "signed", version=1))) == set(files)
 
 
-def test_lineage_with_a_signer_is_read_and_passed_on(api, archive):
+def test_lineage_with_a_signer_is_read_and_passed_on(api, files):
     signer = "ed25519:11qYAYKxCrfVS/7TyWQHOg7hcvPapiMlrwIaaPcHURo="
     before = [{"model": "arm", "version": 3, "signed_by": signer}]
-    files = with_json(unpack(archive), MANIFEST, lambda manifest: manifest["lineage"].update(imported=before))
-    import_archive(api, pack(files), name="once-signed")
-    version = api.get("/v1/models/once-signed/versions/1").json()
-    assert version["lineage"]["imported"][0] == before[0]
-    again = import_archive(api, exported(api, "once-signed", version=1), name="again").json()
-    assert again["lineage"]["imported"][0] == before[0]
+    signed = with_json(files, MANIFEST, lambda manifest: manifest["lineage"].update(imported=before))
+    once = imported(api, pack(signed), name="once-signed")
+    again = imported(api, exported(api, "once-signed", version=1), name="again")
+    for version in (once, again):
+        assert version["lineage"]["imported"][0] == before[0]
 
 
-def test_archive_has_the_name_of_its_model(api, archive):
-    files = unpack(archive)
-    about = json.loads(files["export.json"]) | {"model": "named-inside"}
-    answer = import_archive(api, pack(with_checksums({**files, "export.json": json.dumps(about).encode()})))
-    assert answer.json()["model"] == "named-inside"
+def test_archive_has_the_name_of_its_model(api, files):
+    named = with_json(files, "export.json", lambda about: about.update(model="named-inside"))
+    assert imported(api, pack(named))["model"] == "named-inside"
 
 
 @pytest.mark.skipif(shutil.which("tar") is None, reason="needs tar")
-def test_archive_packed_by_tar_is_imported(api, archive, tmp_path):
-    files = unpack(archive)
+def test_archive_packed_by_tar_is_imported(api, files, tmp_path):
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     packed = subprocess.run(["tar", "-C", tmp_path, "-cf", "-", *files], capture_output=True, check=True).stdout
-    assert import_archive(api, packed, name="by-tar").status_code == 201
+    assert imported(api, packed, name="by-tar")
 
 
 def test_version_has_its_software_hyperparameters_and_metrics(api, trained):

@@ -14,8 +14,8 @@ from lipcore.vocabulary import JOINT_TYPES, ROBOT_ESTIMATORS
 from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.models import archive_import
-from tests.service.data import npz, service_of, train
-from tests.service.models.archives.packing import exported, import_archive
+from tests.service.data import service_of, train, upload
+from tests.service.models.archives.packing import exported, imported
 
 QUICK = lipcore.FitOptions(
     hyperparameter_samples=20, posterior_samples=40, max_iterations=4, starts=1, search_seconds=1.0
@@ -79,11 +79,7 @@ def test_every_trained_version_is_exported_and_imported(
 
 def test_version_of_large_torques_is_healthy_in_the_service(api):
     samples = recording(51, ["prismatic", "prismatic", "revolute"], 1.0, LARGE, 1e-3, slow=100.0)
-    given = {name: getattr(samples, name) for name in ("t", "q", "dq", "ddq", "tau")}
-    uploaded = api.post("/v1/datasets", content=npz(**given), headers={"content-type": "application/x-npz"})
-    assert uploaded.status_code == 201, uploaded.text
-    train(api, "giant", uploaded.json()["id"], joint_types=["prismatic", "prismatic", "revolute"])
-    answer = import_archive(api, exported(api, "giant"), name="giant-again")
-    assert answer.status_code == 201, answer.text
+    train(api, "giant", upload(api, samples)["id"], joint_types=["prismatic", "prismatic", "revolute"])
+    imported(api, exported(api, "giant"), name="giant-again")
     found = verify_home(service_of(api).storage.settings)
     assert [each for each in found.damages if each.kind == "version" and "giant" in each.name] == []
