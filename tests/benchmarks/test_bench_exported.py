@@ -5,7 +5,6 @@ import json
 import pytest
 from rich.console import Console
 
-from benchmarks.exported import running
 from benchmarks.exported.running import SHIPPED, Options, grids, run, targets
 from benchmarks.workload import BenchError
 from tests.lipcore.export.test_c_writer import needs_compiler
@@ -36,4 +35,4 @@ def test_compiler_error_is_reported():
 def test_missing_compiler_is_reported(monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(BenchError, match="cc is not installed"):
-        running.run(Options(SHIPPED, calls=20, queries=20), Console(quiet=True))
+        run(Options(SHIPPED, calls=20, queries=20), Console(quiet=True))

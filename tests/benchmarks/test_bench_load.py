@@ -71,21 +71,15 @@ def test_lost_changed_and_surplus_writes_are_counted(counted):
 
 
 def _results(**changes):
-    found = Results(
-        {"processor": "two cores"},
-        {"model": "small"},
-        Mix(1, 1, 1, 1),
-        10.0,
-        timings={"predict": Timing.of(np.full(100, 1_000_000))},
-        errors={kind: Counter() for kind in running.KINDS},
-        service=[400.0] * 40,
-        children=[300.0] * 40,
-        before=Account(batches=3, rows=75),
-        after=Account(batches=3, rows=75),
-    )
-    for name, value in changes.items():
-        setattr(found, name, value)
-    return found
+    usual = {
+        "timings": {"predict": Timing.of(np.full(100, 1_000_000))},
+        "errors": {kind: Counter() for kind in running.KINDS},
+        "service": [400.0] * 40,
+        "children": [300.0] * 40,
+        "before": Account(batches=3, rows=75),
+        "after": Account(batches=3, rows=75),
+    }
+    return Results({"processor": "two cores"}, {"model": "small"}, Mix(1, 1, 1, 1), 10.0, **{**usual, **changes})
 
 
 @pytest.mark.parametrize(

@@ -22,18 +22,9 @@ PENDULUM = Scene(robot="double-pendulum", seconds=2.0, change_at=1.0, payload=0.
 
 
 @pytest.fixture(scope="module")
-def model() -> TorqueModel:
-    return _trained("lip-chain")
-
-
-@pytest.fixture(scope="module")
 def fitted() -> TorqueModel:
-    return _trained("se")
-
-
-def _trained(estimator: str) -> TorqueModel:
     history = PENDULUM.history(8.0, 10.0)
-    return lipcore.train(history, PENDULUM.arm.joint_types, estimator, lipcore.FitOptions(**QUICK))
+    return lipcore.train(history, PENDULUM.arm.joint_types, "se", lipcore.FitOptions(**QUICK))
 
 
 # the scene
@@ -104,17 +95,8 @@ def test_lag_ends_with_the_first_answer_that_has_the_batch():
 
 
 def tiny(websocket: bool) -> Options:
-    return Options(
-        scene=PENDULUM,
-        fit=QUICK,
-        history_s=8.0,
-        idle_s=0.2,
-        burst_s=0.5,
-        after=(0.5, 1.0),
-        sizes=(200, 400),
-        refit_every=1.0,
-        websocket=websocket,
-    )
+    lengths = {"history_s": 8.0, "idle_s": 0.2, "burst_s": 0.5, "refit_every": 1.0}
+    return Options(scene=PENDULUM, fit=QUICK, after=(0.5, 1.0), sizes=(200, 400), websocket=websocket, **lengths)
 
 
 @pytest.mark.parametrize("websocket", [False, True])

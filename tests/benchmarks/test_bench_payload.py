@@ -49,9 +49,8 @@ def test_contact_torque_is_the_slope_of_the_work_of_its_force():
 
 def test_least_squares_around_the_urdf_learns_the_payload():
     unseen, live = ARM.unseen(CASE, True), ARM.live(CASE)
-    answers, nothing = (
-        rivals._least_squares(ARM.robot, live.rows(rows), unseen) for rows in (slice(300, 700), slice(300))
-    )
+    parts = (live.rows(slice(300, 700)), live.rows(slice(300)))
+    answers, nothing = (rivals._least_squares(ARM.robot, part, unseen) for part in parts)
     assert answers.mean < 0.01 < nothing.mean
     assert answers.lowest > 0.85
 

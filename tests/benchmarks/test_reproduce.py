@@ -20,15 +20,7 @@ from lipcore.robots.simulation import Simulation, simulate
 
 ESTIMATORS = ("se", "rigid-body", "lip-chain")
 JOINTS = ("joint1", "joint2")
-FILES = {
-    "cells.jsonl",
-    "figure1.png",
-    "reliability.png",
-    "results.csv",
-    "results.md",
-    "samples.png",
-    "summary.csv",
-}
+FILES = {"cells.jsonl", "results.csv", "results.md", "summary.csv", "figure1.png", "reliability.png", "samples.png"}
 TINY = ("--robot", "double-pendulum", "--training-sets", "1", "--test-sets", "2", "--samples", "40", "--workers", "1")
 
 
@@ -89,25 +81,22 @@ def test_results_equal_those_computed_here(finished):
     model = lipcore.train(training, robot.joint_types, "lip-chain", FitOptions(device="cpu", prior="zero"))
     test = simulate(robot, Simulation(40, n_sinusoids=100), 1002).rows(slice(None, None, 2))
     answer = model.predict(test.q, test.dq, test.ddq)
-    data = robot.model.createData()
-    true = np.array(
-        [pinocchio.rnea(robot.model, data, *state) for state in zip(test.q, test.dq, test.ddq, strict=True)]
-    )
+    data, states = robot.model.createData(), zip(test.q, test.dq, test.ddq, strict=True)
+    true = np.array([pinocchio.rnea(robot.model, data, *state) for state in states])
     total = np.hypot(answer.tau_std, answer.noise_std)
-    nmse = ((answer.tau - true) ** 2).mean(0) / true.var(0)
-    noisy = ((answer.tau - test.tau) ** 2).mean(0) / test.tau.var(0)
-    coverage = (np.abs(answer.tau - test.tau) <= 1.959963984540054 * total).mean(0)
+    expected = {
+        "nmse": ((answer.tau - true) ** 2).mean(0) / true.var(0),
+        "nmse_noisy": ((answer.tau - test.tau) ** 2).mean(0) / test.tau.var(0),
+        "coverage_95": (np.abs(answer.tau - test.tau) <= 1.959963984540054 * total).mean(0),
+        "width_95": 2 * 1.959963984540054 * total.mean(0),
+        "torque_std": true.std(0),
+    }
+    tolerances = {"coverage_95": {"abs": 1e-5}, "torque_std": {"rel": 1e-5}}
+    found = {(row["estimator"], row["samples"], row["test_seed"], row["joint"]): row for row in rows(finished)}
     for j, joint in enumerate(JOINTS):
-        (row,) = [
-            row
-            for row in rows(finished)
-            if (row["estimator"], row["samples"], row["test_seed"], row["joint"]) == ("lip-chain", "20", "1002", joint)
-        ]
-        assert float(row["nmse"]) == pytest.approx(nmse[j], rel=1e-3)
-        assert float(row["nmse_noisy"]) == pytest.approx(noisy[j], rel=1e-3)
-        assert float(row["coverage_95"]) == pytest.approx(coverage[j], abs=1e-5)
-        assert float(row["width_95"]) == pytest.approx(2 * 1.959963984540054 * total[:, j].mean(), rel=1e-3)
-        assert float(row["torque_std"]) == pytest.approx(true[:, j].std(), rel=1e-5)
+        row = found["lip-chain", "20", "1002", joint]
+        for name, values in expected.items():
+            assert float(row[name]) == pytest.approx(values[j], **tolerances.get(name, {"rel": 1e-3})), name
 
 
 @pytest.mark.slow

@@ -52,17 +52,12 @@ class Block:
 
 def pages() -> list[Path]:
     """Return README.md and the pages of docs that are written by hand."""
-    found = [path for path in sorted((ROOT / "docs").rglob("*.md")) if not _generated(path)]
-    return [ROOT / "README.md", *found]
+    return [path for path in all_pages() if not path.relative_to(ROOT).as_posix().startswith(GENERATED)]
 
 
 def all_pages() -> list[Path]:
     """Return all pages, including generated ones."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-
-
-def _generated(path: Path) -> bool:
-    return path.relative_to(ROOT).as_posix().startswith(GENERATED)
 
 
 def blocks(page: Path) -> list[Block]:

@@ -27,14 +27,19 @@ def environment(name: str) -> dict[str, str]:
 ENVIRONMENTS = {name: environment(name) for name, each in SERVICES.items() if each["image"] == "lipserve"}
 
 
-@pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_settings_exist(name, monkeypatch):
-    for key, value in ENVIRONMENTS[name].items():
+def check_settings(given: dict[str, str], patch: pytest.MonkeyPatch) -> Settings:
+    """Check the settings in the environment of a container; return them."""
+    for key, value in given.items():
         assert isinstance(value, str), f"{key} is {value!r}: quote it"
         if key.startswith("LIPSERVE_"):
             assert key.removeprefix("LIPSERVE_").lower() in Settings.model_fields, key
-            monkeypatch.setenv(key, value)
-    Settings()
+            patch.setenv(key, value)
+    return Settings(host="0.0.0.0")
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_settings_exist(name, monkeypatch):
+    check_settings(ENVIRONMENTS[name], monkeypatch)
 
 
 def check_command(program: str, *words: str) -> None:

@@ -13,7 +13,7 @@ from service.api.server.sockets import DRAIN_S
 from service.app import create_app
 from service.foundation.settings import Settings
 from tests.docs.blocks import ROOT
-from tests.docs.test_deployments import PORT, check_command, port_of
+from tests.docs.test_deployments import PORT, check_command, check_settings, port_of
 
 FOLDER = ROOT / "deploy/kubernetes"
 ENTRIES = ("single", "shared", "kserve")
@@ -71,13 +71,18 @@ def environment(entry: str, container: dict[str, Any]) -> dict[str, str]:
     return given
 
 
+def containers_of(pod: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """Return the containers of a pod."""
+    return [] if pod is None else [*pod.get("initContainers", []), *pod["containers"]]
+
+
 def containers() -> list[Any]:
     """Return every container with its entry and owner."""
     return [
         pytest.param(entry, name, container, id=f"{entry}-{name}-{container['name']}")
         for entry in ENTRIES
         for name, pod in pods(entry).items()
-        for container in (*pod.get("initContainers", []), *pod["containers"])
+        for container in containers_of(pod)
     ]
 
 
@@ -114,8 +119,7 @@ def test_kustomize_renders_checked_objects(entry):
     besides = {key for key in expected if key[1] == "lipserve-gpu-worker" or key[0] == "ServiceMonitor"}
     assert rendered.keys() == expected.keys() - besides
     for key, each in rendered.items():
-        pod = pod_of(each)
-        for container in () if pod is None else (*pod.get("initContainers", []), *pod["containers"]):
+        for container in containers_of(pod_of(each)):
             registry, _, image = container["image"].rpartition("/")
             assert registry
             assert image.startswith(f"{OWN_NAME}:")
@@ -126,12 +130,7 @@ def test_kustomize_renders_checked_objects(entry):
 @pytest.mark.slow
 @pytest.mark.parametrize(("entry", "name", "container"), containers())
 def test_containers_have_valid_settings_commands_and_limits(entry, name, container, monkeypatch):
-    for key, value in environment(entry, container).items():
-        assert isinstance(value, str), f"{key} is {value!r}: quote it"
-        if key.startswith("LIPSERVE_"):
-            assert key.removeprefix("LIPSERVE_").lower() in Settings.model_fields, key
-            monkeypatch.setenv(key, value)
-    settings = Settings(host="0.0.0.0")
+    settings = check_settings(environment(entry, container), monkeypatch)
     check_command(*container["command"])
     assert container["image"] in (OWN_NAME, "lipserve-cuda")
     assert container["resources"]["limits"]["memory"]
@@ -168,8 +167,7 @@ def test_references_between_objects_resolve(entry):
         if pod is not None:
             volumes = {volume["name"] for volume in pod["volumes"]}
             volumes |= {claim["metadata"]["name"] for claim in spec.get("volumeClaimTemplates", [])}
-            every = (*pod.get("initContainers", []), *pod["containers"])
-            assert {mount["name"] for one in every for mount in one["volumeMounts"]} == volumes
+            assert {mount["name"] for one in containers_of(pod) for mount in one["volumeMounts"]} == volumes
         if kind == "Service":
             (target,) = (
                 other["spec"]["template"]["spec"]["containers"][0]
@@ -184,9 +182,7 @@ def test_references_between_objects_resolve(entry):
             assert spec["selector"]["matchLabels"].items() <= selected["metadata"]["labels"].items()
             (endpoint,) = spec["endpoints"]
             assert endpoint["port"] in {port["name"] for port in selected["spec"]["ports"]}
-            rule = create_app().state.rules.of("GET", endpoint["path"])
-            assert rule is not None
-            assert rule.scope == "read"
+            assert create_app().state.rules.of("GET", endpoint["path"]).scope == "read"
         if kind == "InferenceService":
             model = spec["predictor"]["model"]
             runtime = made["ServingRuntime", model["runtime"]]["spec"]

@@ -78,14 +78,15 @@ def unknown(text: str, known: set[str]) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("folder", ["lipcore", "service", "clients", "benchmarks"])
+@pytest.mark.parametrize("folder", CODE)
 def test_names_in_docstrings_exist(known: set[str], folder: str) -> None:
-    found = {}
-    for path in sources(folder):
-        wrong = [name for text in texts(ast.parse(path.read_text("utf-8"))) for name in unknown(text, known)]
-        if wrong:
-            found[str(path.relative_to(ROOT))] = wrong
-    assert found == {}
+    found = {
+        str(path.relative_to(ROOT)): [
+            name for text in texts(ast.parse(path.read_text("utf-8"))) for name in unknown(text, known)
+        ]
+        for path in sources(folder)
+    }
+    assert {path: wrong for path, wrong in found.items() if wrong} == {}
 
 
 def test_names_in_documents_exist(known: set[str]) -> None:

@@ -1,6 +1,6 @@
 """Every block of the documentation runs or has a reason not to, and its output is compared."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -53,10 +53,10 @@ QUICK_PAGES = [page for page in pages() if any(not each.serves for each in selec
 SLOW_PAGES = [page for page in pages() if len(select_blocks(page, slow=True)) > len(select_blocks(page, slow=False))]
 
 
-def run_blocks(runner: BlockRunner, page: Path, found: Sequence[Block]) -> None:
+def run_blocks(runner: BlockRunner, page: Path, slow: bool) -> None:
     """Run blocks of a page."""
     with Session(runner, page_id(page)) as session:
-        for block in found:
+        for block in select_blocks(page, slow):
             session.run(block)
 
 
@@ -70,11 +70,11 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BlockRunner]:
 
 @pytest.mark.parametrize("page", few(QUICK_PAGES, kept=lambda page: page.stem == "README"), ids=page_id)
 def test_quick_blocks_of_page_run(runner, page):
-    run_blocks(runner, page, select_blocks(page, slow=False))
+    run_blocks(runner, page, slow=False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", SLOW_PAGES, ids=page_id)
 def test_all_blocks_of_page_run(tmp_path, page):
     with Server(tmp_path / "home", warm=True) as server:
-        run_blocks(BlockRunner(tmp_path, server), page, select_blocks(page, slow=True))
+        run_blocks(BlockRunner(tmp_path, server), page, slow=True)

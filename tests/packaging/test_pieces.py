@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 import tomllib
-from io import BytesIO
 
 import numpy as np
 import pytest
@@ -15,7 +14,8 @@ from lipcore import extras
 from lipcore.extras import EXTRAS, MissingExtraError
 from lipserve import ApiError, Client, StreamClient
 from tests import ROOT
-from tests.service.data import DEADLINE, eventually
+from tests.service.data import DEADLINE, csv, error, eventually, npz, post
+from tests.service.robots.test_robots import post_robot, urdf
 from tests.service.server import Server
 
 pytestmark = pytest.mark.slow  # starts services without extras
@@ -25,10 +25,6 @@ BASE = {re.split(r"[^\w-]", line)[0] for line in PROJECT["dependencies"]}
 HIDDEN = [name for each in EXTRAS.values() for name in each.modules if name not in BASE]
 """Modules of extras that the dependencies do not include."""
 ZEROS = [0.0] * 7
-URDF = b"""<robot name="one"><link name="base"/><link name="arm"><inertial><mass value="1"/>
-<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
-<joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
 
 
 def without(*modules):
@@ -39,9 +35,9 @@ def without(*modules):
 
 def recording(rows=200):
     """Return t, q, dq, ddq and tau of two joints."""
-    t = np.arange(rows) / 50
-    angle = np.outer(t, [1.7, 2.3])
-    q, dq, ddq = np.sin(angle), np.array([1.7, 2.3]) * np.cos(angle), -(np.array([1.7, 2.3]) ** 2) * np.sin(angle)
+    t, rate = np.arange(rows) / 50, np.array([1.7, 2.3])
+    angle = np.outer(t, rate)
+    q, dq, ddq = np.sin(angle), rate * np.cos(angle), -(rate**2) * np.sin(angle)
     return {"t": t, "q": q, "dq": dq, "ddq": ddq, "tau": 2 * ddq + 0.1 * dq}
 
 
@@ -95,37 +91,29 @@ def test_learner_starts_with_the_first_frame_with_torque(server, client):
 
 
 @pytest.mark.skipif("pyarrow" not in HIDDEN, reason="Arrow is part of the base")
-def test_csv_names_its_extra_and_npz_is_read(server, client):
+def test_csv_names_its_extra_and_npz_is_read(server):
     columns = recording()
     rows = np.column_stack(list(columns.values()))
     names = ["t", *(f"{name}{joint}" for name in ("q", "dq", "ddq", "tau") for joint in (1, 2))]
-    csv = "\n".join([",".join(names), *(",".join(map(repr, map(float, row))) for row in rows)])
-    answer = server.client.post("/v1/datasets", content=csv, headers={"content-type": "text/csv"})
-    assert answer.status_code == 501
-    error = answer.json()["error"]
-    assert error["code"] == "not_installed"
-    assert error["message"].endswith("needs the module pyarrow, which is not installed: pip install 'lipserve[ingest]'")
-    assert error["detail"][0] == {"field": "extra", "value": "ingest", "expected": "pip install 'lipserve[ingest]'"}
-    packed = BytesIO()
-    np.savez(packed, **columns)
-    answer = server.client.post(
-        "/v1/datasets", content=packed.getvalue(), headers={"content-type": "application/x-npz"}
+    answer = post(server.client, csv(dict(zip(names, rows.T.tolist(), strict=True))), "text/csv")
+    missing = error(answer, 501, "not_installed")
+    assert missing["message"].endswith(
+        "needs the module pyarrow, which is not installed: pip install 'lipserve[ingest]'"
     )
-    assert answer.status_code == 201
-    assert answer.json()["report"]["rows"] == len(rows)
+    assert missing["detail"][0] == {"field": "extra", "value": "ingest", "expected": "pip install 'lipserve[ingest]'"}
+    answer = post(server.client, npz(**columns))
+    assert (answer.status_code, answer.json()["report"]["rows"]) == (201, len(rows))
 
 
 @pytest.mark.skipif("pinocchio" not in HIDDEN, reason="Pinocchio is part of the base")
 def test_urdf_names_its_extra(server):
-    answer = server.client.post("/v1/robots", content=URDF, headers={"content-type": "application/xml"})
-    assert (answer.status_code, answer.json()["error"]["code"]) == (501, "not_installed")
-    assert "pip install 'lipserve[robots]'" in answer.json()["error"]["message"]
+    missing = error(post_robot(server.client, urdf()), 501, "not_installed")
+    assert "pip install 'lipserve[robots]'" in missing["message"]
 
 
 @pytest.mark.skipif("torch" not in HIDDEN, reason="torch is part of the base")
-def test_training_with_torch_names_its_extra(client, tmp_path):
-    np.savez(tmp_path / "two.npz", **recording())
-    data = client.upload(tmp_path / "two.npz").id
+def test_training_with_torch_names_its_extra(server, client):
+    data = post(server.client, npz(**recording())).json()["id"]
     with pytest.raises(ApiError, match=r"pip install 'lipserve\[train\]'") as caught:
         client.train("two", [data], estimator="se")
     assert (caught.value.status, caught.value.code) == (501, "not_installed")
@@ -134,21 +122,14 @@ def test_training_with_torch_names_its_extra(client, tmp_path):
 @pytest.mark.parametrize(
     ("command", "module", "extra"),
     [
-        (["simulate", "panda", "x.npz"], "pinocchio", "robots"),
-        (["serve", "--port", "0", "--grpc-port", "0"], "grpc", "grpc"),
+        ("simulate panda x.npz", "pinocchio", "robots"),
+        ("serve --port 0 --grpc-port 0", "grpc", "grpc"),
     ],
 )
 def test_commands_name_the_extra_and_exit_with_1(command, module, extra, tmp_path):
-    environment = {**os.environ, **without(module), "LIPSERVE_HOME": str(tmp_path / "home")}
-    done = subprocess.run(
-        [sys.executable, "-m", "service", *command],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=DEADLINE,
-    )
+    options = {"env": {**os.environ, **without(module), "LIPSERVE_HOME": str(tmp_path / "home")}, "cwd": tmp_path}
+    words = [sys.executable, "-m", "service", *command.split()]
+    done = subprocess.run(words, **options, capture_output=True, text=True, check=False, timeout=DEADLINE)
     assert done.returncode == 1, done.stderr
     assert f"needs the module {module}, which is not installed: pip install 'lipserve[{extra}]'" in done.stderr
     assert "Traceback" not in done.stderr

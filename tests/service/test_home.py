@@ -22,23 +22,15 @@ from tests.service.warm import Served
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
 
 
-def start_service(home, **settings):
-    return TestClient(create_app(Settings(home=home, **settings)), ADDRESS)
+def start_service(home):
+    return TestClient(create_app(Settings(home=home)), ADDRESS)
 
 
-def interrupted_job(name, dataset, attempts, model="again", state="running", **fields):
+def interrupted_job(name, dataset, model="again", state="running", **fields):
     """Return the row of a job that an earlier run had not finished."""
     request = {"datasets": [dataset], "estimator": "lip", "joint_types": ["revolute"] * 2, "options": QUICK}
-    return JobRow(
-        id=name,
-        model=model,
-        state=state,
-        request=request,
-        progress={"stage": "hyperparameters", "iteration": 3},
-        attempts=attempts,
-        created_at=now(),
-        **fields,
-    )
+    progress = {"stage": "hyperparameters", "iteration": 3}
+    return JobRow(id=name, model=model, state=state, request=request, progress=progress, created_at=now(), **fields)
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +47,8 @@ def second_start(tmp_path_factory):
         }
     database = Database.of(Settings(home=home))
     with database.transaction() as session:
-        session.add(interrupted_job("job_again", dataset, attempts=1, cancel_requested=False))
-        session.add(interrupted_job("job_enough", dataset, attempts=3, cancel_requested=False))
-        session.add(interrupted_job("job_unwanted", dataset, attempts=1, cancel_requested=True))
+        for name, attempts, unwanted in (("again", 1, False), ("enough", 3, False), ("unwanted", 1, True)):
+            session.add(interrupted_job(f"job_{name}", dataset, attempts=attempts, cancel_requested=unwanted))
         for number in (1, 2):
             session.add(interrupted_job(f"job_waiting{number}", dataset, attempts=0, model="waiting", state="queued"))
     database.close()
@@ -94,15 +85,10 @@ def test_leftovers_of_interrupted_writes_are_swept(second_start):
 
 
 @pytest.mark.slow
-def test_interrupted_job_is_done_again(second_start):
+def test_interrupted_jobs_are_done_again_up_to_three_times_or_cancelled(second_start):
     api, _, _ = second_start
     seen = ended(api, "job_again")
     assert (seen["state"], seen["attempts"], seen["version"]) == ("succeeded", 2, 1)
-
-
-@pytest.mark.slow
-def test_interrupted_jobs_fail_after_three_attempts_or_are_cancelled(second_start):
-    api, _, _ = second_start
     seen = job(api, "job_enough")
     assert (seen["state"], seen["attempts"], seen["error"]["code"]) == ("failed", 3, "interrupted")
     assert seen["finished_at"]
@@ -123,7 +109,7 @@ def make_earlier_home(home, job):
 
 def test_upgrade_adds_its_shipped_model(home):
     make_earlier_home(home, job=None)
-    with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
+    with start_service(home) as api:
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 2
         query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
         assert api.post("/v1/models/panda-sim/predict", json=query).json()["version"] == 2
@@ -136,37 +122,30 @@ def test_upgrade_adds_its_shipped_model(home):
 @pytest.mark.slow
 def test_upgrade_keeps_a_model_that_the_user_has_trained(home):
     make_earlier_home(home, job="job_of_the_user")
-    with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
+    with start_service(home) as api:
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1
 
 
 @pytest.mark.slow
 def test_second_service_on_a_home_is_rejected(second_start):
-    _, _, home = second_start
-    with (
-        pytest.raises(HomeInUseError, match=r"another service uses .*: stop it, or set LIPSERVE_HOME"),
-        start_service(home),
-    ):
+    message = r"another service uses .*: stop it, or set LIPSERVE_HOME"
+    with pytest.raises(HomeInUseError, match=message), start_service(second_start[-1]):
         pass
 
 
-def test_deleted_lock_file_admits_no_second_service(tmp_path):
-    with lock_home(tmp_path / "home"):
-        (tmp_path / "home" / ".lock").unlink()
+def test_second_service_is_rejected_if_the_lock_file_or_the_lock_of_the_folder_is_lost(home):
+    with lock_home(home):
+        (home / ".lock").unlink()
         with pytest.raises(HomeInUseError):
-            lock_home(tmp_path / "home")
-    lock_home(tmp_path / "home").close()
-
-
-def test_lock_file_is_used_if_folders_cannot_be_locked(tmp_path):
-    with (tmp_path / ".lock").open("w") as file:
+            lock_home(home)
+    lock_home(home).close()
+    with (home / ".lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         with pytest.raises(HomeInUseError):
-            lock_home(tmp_path)
+            lock_home(home)
 
 
-def test_new_home_belongs_to_its_owner_alone(tmp_path):
-    home = tmp_path / "home"
+def test_new_home_belongs_to_its_owner_alone(home):
     mask = os.umask(0)
     try:
         lock_home(home).close()

@@ -10,6 +10,7 @@ import pytest
 from lipcore.extras import EXTRAS
 from service import __version__
 from service.foundation.settings import shipped_models
+from tests.choosing import few
 from tests.packaging.test_pieces import BASE
 
 NUMERICS = ("numpy", "scipy", "numba")
@@ -17,65 +18,47 @@ FITTING = ("scipy.optimize", "scipy.signal", "scipy.stats")
 CLIENTS = ("httpx", "lipserve.sending", "lipserve.stream", "service.cli.demo", "benchmarks", "matplotlib", "pandas")
 OF_EXTRAS = {module for each in EXTRAS.values() for module in each.modules if module not in BASE}
 SERVING = ("fastapi", "uvicorn", "sqlalchemy", "pydantic", "service")
+WEB = ("fastapi", "starlette", "uvicorn", "service.api")
 
 
-def imported_modules(statement):
-    """Return the modules that a fresh interpreter has imported after a statement."""
+CLIENT_COMMANDS = ("answers", "data", "jobs", "models", "open", "stream")
+LIGHT = ("__main__", "runtime.process")
+"""Modules that a spawned process imports before it sets its priority: its parent's main module, its initializer's."""
+WORKERS = ("training.worker", "learning.learner.worker", "learning.weigher.worker", "datasets.caged", "cli.verify")
+ARM = str(shipped_models() / "panda-sim")
+CASES = {
+    # a statement, modules that it needs, modules that it does not
+    "serve": ("import service.cli.serve", {"service.app", "numba", "fastapi"}, (*FITTING, *CLIENTS, *OF_EXTRAS)),
+    "list of commands": (
+        "from service.cli.main import app; import typer; typer.main.get_command(app)",
+        set(),
+        (*NUMERICS, *CLIENTS, "lipcore", "fastapi", "pydantic"),
+    ),
+    "help of client commands": (
+        "\n".join(f"import service.cli.{name}" for name in CLIENT_COMMANDS),
+        set(),
+        (*NUMERICS, *CLIENTS, "fastapi"),
+    ),
+    "load a model": (
+        f"import lipcore\nlipcore.load({ARM!r}).predict(*[[0.0] * 7] * 3)",
+        {"lipcore.model.torque_model"},
+        (*FITTING, *SERVING, "pinocchio", "matplotlib"),
+    ),
+    **{name: (f"import service.{name}", {f"service.{name}"}, (*NUMERICS, "lipcore", "fastapi")) for name in LIGHT},
+    **{name: (f"import service.{name}", {f"service.{name}"}, WEB) for name in WORKERS},
+}
+QUICK = ("list of commands", "help of client commands", *LIGHT)
+
+
+@pytest.mark.parametrize("name", few(CASES, kept=QUICK.__contains__))
+def test_processes_import_only_needed_modules(name):
+    statement, needed, unneeded = CASES[name]
     script = f"import json, sys\n{statement}\nprint(json.dumps(sorted(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return set(json.loads(done.stdout.splitlines()[-1]))
-
-
-@pytest.mark.slow
-def test_serve_imports_no_client_and_no_experiment():
-    result = imported_modules("import service.cli.serve")
-    assert {"service.app", "numba", "fastapi"} <= result
-    assert result.isdisjoint((*FITTING, *CLIENTS, *OF_EXTRAS))
-
-
-def test_listing_commands_imports_no_numerics():
-    result = imported_modules("from service.cli.main import app; import typer; typer.main.get_command(app)")
-    assert result.isdisjoint((*NUMERICS, *CLIENTS, "lipcore", "fastapi", "pydantic"))
-
-
-def test_client_commands_import_neither_numerics_nor_httpx_for_help():
-    names = ("answers", "data", "jobs", "models", "open", "stream")
-    result = imported_modules("\n".join(f"import service.cli.{name}" for name in names))
-    assert result.isdisjoint((*NUMERICS, *CLIENTS, "fastapi"))
-
-
-@pytest.mark.slow
-def test_loading_a_model_imports_neither_fitting_nor_service():
-    folder, zeros = str(shipped_models() / "panda-sim"), [0.0] * 7
-    result = imported_modules(f"import lipcore\nlipcore.load({folder!r}).predict({zeros}, {zeros}, {zeros})")
-    assert "lipcore.model.torque_model" in result
-    assert result.isdisjoint((*FITTING, *SERVING, "pinocchio", "matplotlib"))
-
-
-@pytest.mark.parametrize("module", ["service.__main__", "service.runtime.process"])
-def test_training_process_sets_its_priority_before_importing_numerics(module):
-    """A spawned process imports its parent's main module, then its initializer's modules, then those of the job."""
-    result = imported_modules(f"import {module}")
-    assert module in result
-    assert result.isdisjoint((*NUMERICS, "lipcore", "fastapi"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "module",
-    [
-        "service.training.worker",
-        "service.learning.learner.worker",
-        "service.learning.weigher.worker",
-        "service.datasets.caged",
-        "service.cli.verify",
-    ],
-)
-def test_processes_without_http_import_no_web_framework(module):
-    result = imported_modules(f"import {module}")
-    assert module in result
-    assert result.isdisjoint(("fastapi", "starlette", "uvicorn", "service.api"))
+    modules = set(json.loads(done.stdout.splitlines()[-1]))
+    assert needed <= modules
+    assert modules.isdisjoint(unneeded)
 
 
 def test_command_starts_in_the_light_main_module():

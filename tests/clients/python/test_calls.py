@@ -25,33 +25,27 @@ def public(client):
     return {name for name in vars(client) if not name.startswith("_")}
 
 
-def test_every_route_has_a_call(api):
+def test_every_route_has_a_call_that_is_a_method_of_both_clients(api):
     paths = api.get("/openapi.json").json()["paths"]
     documented = {(method.upper(), path) for path, found in paths.items() for method in found if method in METHODS}
     assert set(ROUTES) == documented
+    for client in (Client, AsyncClient):
+        methods = made_of(client)
+        assert set(methods.values()) == set(ROUTES.values())
+        assert all(method == call for method, call in methods.items())
 
 
-@pytest.mark.parametrize("client", [Client, AsyncClient])
-def test_every_call_is_a_method_of_the_same_name(client):
-    methods = made_of(client)
-    assert set(methods.values()) == set(ROUTES.values())
-    assert all(method == call for method, call in methods.items())
-
-
-def test_the_clients_have_the_same_methods():
+def test_clients_have_the_same_methods_with_signatures_and_docstrings():
     assert public(Client) == public(AsyncClient)
     for name in public(Client):
-        one, other = (inspect.signature(getattr(client, name)) for client in (Client, AsyncClient))
-        assert list(one.parameters.values()) == list(other.parameters.values()), name
-
-
-def test_methods_have_signatures_and_docstrings():
+        one, other = (getattr(client, name) for client in (Client, AsyncClient))
+        parameters = [list(inspect.signature(each).parameters.values()) for each in (one, other)]
+        assert parameters[0] == parameters[1], name
+        assert inspect.getdoc(one), name
+        assert inspect.getdoc(other), name
     assert str(inspect.signature(Client.job)) == "(self, /, job: 'str') -> 'Job'"
     assert str(inspect.signature(Client.robots)) == "(self, /) -> 'Iterator[Robot]'"
     assert str(inspect.signature(AsyncClient.live)) == "(self, /, model: 'str') -> 'AsyncIterator[Live]'"
-    for client in (Client, AsyncClient):
-        for name in public(client):
-            assert inspect.getdoc(getattr(client, name)), name
 
 
 def test_names_are_quoted_and_paths_match_the_given_names():
@@ -88,21 +82,25 @@ def later(status=429, **headers):
 def test_lost_connection_is_retried(pauses):
     client, sent = scripted(LOST, httpx.RemoteProtocolError("cut"), httpx.Response(200, json=MODEL))
     assert client.model("m").name == "m"
-    assert len(sent) == 3
-    assert len(pauses) == 2
+    assert (len(sent), len(pauses)) == (3, 2)
     assert FIRST_PAUSE_S / 2 <= pauses[0] <= FIRST_PAUSE_S <= pauses[1] <= 2 * FIRST_PAUSE_S
 
 
-def test_retries_are_limited(pauses):
-    client, sent = scripted(LOST)
-    with pytest.raises(ServiceUnreachableError, match="does not answer any more"):
+@pytest.mark.parametrize(
+    ("failure", "options", "message", "retries"),
+    [
+        (LOST, {}, "does not answer any more", RETRIES),
+        (LOST, {"retries": 0}, "does not answer any more", 0),
+        (httpx.ConnectError("refused"), {"reached": False}, "start one with `lipserve serve`", 0),  # it never answered
+        (httpx.ReadTimeout("slow"), {}, r"\(timeout\)", 0),
+    ],
+)
+def test_retries_are_limited_to_lost_connections(pauses, failure, options, message, retries):
+    client, sent = scripted(failure, **options)
+    with pytest.raises(ServiceUnreachableError, match=message):
         client.model("m")
-    assert len(sent) == 1 + RETRIES
+    assert (len(sent), len(pauses)) == (1 + retries, retries)
     assert sum(pauses) <= FIRST_PAUSE_S * 2**RETRIES
-    client, sent = scripted(LOST, retries=0)
-    with pytest.raises(ServiceUnreachableError):
-        client.model("m")
-    assert len(sent) == 1
 
 
 def test_calls_that_are_not_idempotent_are_not_repeated(pauses):
@@ -117,20 +115,6 @@ def test_calls_that_are_not_idempotent_are_not_repeated(pauses):
         with pytest.raises(ServiceUnreachableError):
             ask()
     assert (len(sent), pauses) == (5, [])
-
-
-@pytest.mark.parametrize(
-    ("failure", "reached", "message"),
-    [
-        (httpx.ConnectError("refused"), False, "start one with `lipserve serve`"),  # it never answered
-        (httpx.ReadTimeout("slow"), True, r"\(timeout\)"),
-    ],
-)
-def test_hopeless_calls_are_not_retried(pauses, failure, reached, message):
-    client, sent = scripted(failure, reached=reached)
-    with pytest.raises(ServiceUnreachableError, match=message):
-        client.model("m")
-    assert (len(sent), pauses) == (1, [])
 
 
 def test_client_waits_for_a_service_that_answered_before(pauses):

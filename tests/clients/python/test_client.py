@@ -1,7 +1,6 @@
 """Both Python clients against a real server: the synchronous one, the asynchronous one, and streams."""
 
 import asyncio
-import re
 
 import httpx
 import numpy as np
@@ -9,7 +8,8 @@ import pytest
 
 from lipserve import ApiError, AsyncClient, AsyncStreamClient, Client, ServiceUnreachableError, StreamError
 from service.cli.simulate import write_recording
-from tests.service.data import DEADLINE, QUICK, stream, upload
+from tests.clients.python.conftest import over
+from tests.service.data import ADDRESS, DEADLINE, QUICK, stream, upload
 from tests.service.server import free_port
 from tests.service.streams import MOTION, TAU
 
@@ -43,12 +43,11 @@ def test_wait_cancel_and_retry_jobs(client, server):
 
 
 def test_api_errors_have_code_message_and_detail(client, tmp_path):
-    with pytest.raises(ApiError) as caught:
+    with pytest.raises(ApiError, match="`q` has 6 values; this model has 7 joints: panda_joint1") as caught:
         client.predict("panda-sim", [0.0] * 6, [0.0] * 6, [0.0] * 6)
-    assert (caught.value.status, caught.value.code) == (422, "invalid_request")
-    assert str(caught.value) == caught.value.message
-    assert "`q` has 6 values; this model has 7 joints: panda_joint1" in caught.value.message
-    assert caught.value.detail[0]["field"] == "q"
+    error = caught.value
+    assert (error.status, error.code, error.detail[0]["field"]) == (422, "invalid_request", "q")
+    assert str(error) == error.message
     with pytest.raises(ApiError, match="no model 'nobody'"):
         client.export("nobody", tmp_path / "nobody.tar")
     assert list(tmp_path.iterdir()) == []
@@ -70,11 +69,13 @@ def test_unreachable_service_error_has_a_hint(client, tmp_path):
             alone.upload(tmp_path / "stream.xlsx")
 
 
-def ask(server, work):
-    """Run `work` with a client."""
+def ask(url, work, transport=None):
+    """Run `work` with a client, over a scripted transport if one is given."""
 
     async def main():
-        async with AsyncClient(server.url) as client:
+        async with AsyncClient(url) as client:
+            if transport is not None:
+                client._http = httpx.AsyncClient(transport=transport, base_url=url)
             return await asyncio.wait_for(work(client), DEADLINE)
 
     return asyncio.run(main())
@@ -95,7 +96,7 @@ def test_async_client_from_files_to_torques(streaming, tmp_path):
         assert (await client.set_learning("awaited-copy", contact_threshold=8.0)).options.contact_threshold == 8.0
         return await client.predict("awaited", *MOTION), await client.evaluate("awaited", dataset.id)
 
-    answer, evaluated = ask(streaming.server, work)
+    answer, evaluated = ask(streaming.server.url, work)
     with Client(streaming.server.url) as client:
         np.testing.assert_allclose(client.predict("awaited", *MOTION).tau, answer.tau, rtol=1e-9)
         assert client.evaluate("awaited", evaluated.dataset).as_dict() == evaluated.as_dict()
@@ -113,19 +114,17 @@ def test_async_client_raises_api_and_connection_errors(streaming, tmp_path):
             await anext(client.job_events("job_nowhere"))
         assert await client.ready()
 
-    ask(streaming.server, work)
+    async def alone(client):
+        assert not await client.ready()
+        with pytest.raises(ServiceUnreachableError, match="lipserve serve"):
+            await client.model("pendulum")
+
+    ask(streaming.server.url, work)
     assert list(tmp_path.iterdir()) == []
-
-    async def alone():
-        async with AsyncClient(f"http://127.0.0.1:{free_port()}") as client:
-            assert not await client.ready()
-            with pytest.raises(ServiceUnreachableError, match="lipserve serve"):
-                await client.model("pendulum")
-
-    asyncio.run(alone())
+    ask(f"http://127.0.0.1:{free_port()}", alone)
 
 
-def test_async_client_retries_after_a_lost_connection(monkeypatch):
+def test_async_client_retries_after_a_lost_connection():
     sent = []
 
     def answer(request):
@@ -134,12 +133,10 @@ def test_async_client_retries_after_a_lost_connection(monkeypatch):
             raise httpx.ReadError("lost")
         return httpx.Response(200, json={"items": [], "next_cursor": None})
 
-    async def work():
-        client = AsyncClient()
-        client._http = httpx.AsyncClient(transport=httpx.MockTransport(answer), base_url="http://localhost")
+    async def work(client):
         return [each async for each in client.models()]
 
-    assert asyncio.run(work()) == []
+    assert ask(ADDRESS, work, httpx.MockTransport(answer)) == []
     assert len(sent) == 3
 
 
@@ -151,28 +148,20 @@ def test_answer_of_another_release_raises_an_error_with_a_hint():
         "/v1/models/arm": b"<html>",
     }
     transport = httpx.MockTransport(lambda request: httpx.Response(200, content=bodies[request.url.path]))
+    message = r"The answer to GET /v1/models/arm\S* could not be read: .* Install the client"
 
-    async def work():
-        client = AsyncClient()
-        client._http = httpx.AsyncClient(transport=transport, base_url="http://localhost")
-        with pytest.raises(ApiError) as learning:
-            await client.learning("arm")
-        with pytest.raises(ApiError) as live:
-            await anext(client.live("arm"))
-        return [learning, live]
+    async def work(client):
+        for call in (client.learning, client.model, lambda model: anext(client.live(model))):
+            with pytest.raises(ApiError, match=message) as caught:
+                await call("arm")
+            assert (caught.value.status, caught.value.code) == (200, "unreadable_answer")
 
-    with Client() as client:
-        client._http = httpx.Client(transport=transport, base_url="http://localhost")
-        errors = asyncio.run(work())
+    ask(ADDRESS, work, transport)
+    with over(transport) as client:
         for call in (client.learning, client.model, lambda model: next(client.live(model))):
-            with pytest.raises(ApiError) as caught:
+            with pytest.raises(ApiError, match=message) as caught:
                 call("arm")
-            errors.append(caught)
-    for error in errors:
-        assert (error.value.status, error.value.code) == (200, "unreadable_answer")
-        assert re.match(
-            r"The answer to GET /v1/models/arm\S* could not be read: .* Install the client", error.value.message
-        )
+            assert (caught.value.status, caught.value.code) == (200, "unreadable_answer")
 
 
 def test_streams(streaming):
@@ -194,7 +183,7 @@ def test_streams(streaming):
             assert (await opened.predict(*MOTION)).late_answers == 1
             assert opened.refusals == ()
 
-    ask(streaming.server, work)
+    ask(streaming.server.url, work)
 
 
 def test_failed_streams(streaming):
@@ -213,4 +202,4 @@ def test_failed_streams(streaming):
             async with AsyncStreamClient("pendulum", f"http://127.0.0.1:{free_port()}"):
                 pass
 
-    ask(streaming.server, work)
+    ask(streaming.server.url, work)

@@ -33,12 +33,17 @@ def queue(api, key, dataset, model="by-key", **more):
 
 
 def test_repeated_upload_makes_one_data_set(api):
-    first = post(api, "up-1", name="a")
-    again = post(api, "up-1", name="a")
-    assert (first.status_code, again.status_code) == (201, 201)
+    first, again = (post(api, "up-1", name="a") for _ in range(2))
+    check_repeated(first, again, 201)
     assert again.json() == first.json()
-    assert again.headers["location"] == first.headers["location"]
     assert post(api, "up-2", name="a").json()["id"] != first.json()["id"]
+
+
+def check_repeated(first, again, status):
+    """Check that both answers are about the same object."""
+    assert (first.status_code, again.status_code) == (status, status)
+    assert again.json()["id"] == first.json()["id"]
+    assert again.headers["location"] == first.headers["location"]
 
 
 @pytest.mark.parametrize("change", [{"name": "b"}, {"cutoff": 5}, {"content": body(seed=82)}])
@@ -65,11 +70,8 @@ def test_concurrent_uploads_make_one_data_set(api):
 
 
 def test_repeated_request_queues_one_job(api, pendulum):
-    first = queue(api, "job-1", pendulum["id"])
-    again = queue(api, "job-1", pendulum["id"])
-    assert (first.status_code, again.status_code) == (202, 202)
-    assert again.json()["id"] == first.json()["id"]
-    assert again.headers["location"] == first.headers["location"]
+    first, again = (queue(api, "job-1", pendulum["id"]) for _ in range(2))
+    check_repeated(first, again, 202)
     ended(api, first.json()["id"])
     late = queue(api, "job-1", pendulum["id"])
     assert (late.status_code, late.json()["state"]) == (202, "succeeded")  # the job as it is now
@@ -96,14 +98,12 @@ def test_repeated_retry_queues_one_job(api, pendulum):
     failed = queue(api, "job-5", pendulum["id"], "retried", options={"max_iterations": 10_000}).json()["id"]
     assert api.post(f"/v1/jobs/{failed}/cancel").status_code == 200
     ended(api, failed)
-    made = [api.post(f"/v1/jobs/{failed}/retry", headers={KEY: "retry-1"}) for _ in range(2)]
-    assert [answer.status_code for answer in made] == [202, 202]
-    first, again = (answer.json() for answer in made)
-    assert first["id"] == again["id"]
-    assert first["retry_of"] == failed
+    first, again = (api.post(f"/v1/jobs/{failed}/retry", headers={KEY: "retry-1"}) for _ in range(2))
+    check_repeated(first, again, 202)
+    assert first.json()["retry_of"] == failed
     error(queue(api, "retry-1", pendulum["id"]), 409, "conflict")
-    api.post(f"/v1/jobs/{first['id']}/cancel")
-    ended(api, first["id"])
+    api.post(f"/v1/jobs/{first.json()['id']}/cancel")
+    ended(api, first.json()["id"])
 
 
 @pytest.mark.slow

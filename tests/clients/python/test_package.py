@@ -4,7 +4,6 @@ import json
 import runpy
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -12,28 +11,15 @@ import lipserve
 from lipserve import AsyncClient, Client, StreamClient, StreamError
 from lipserve.address import DEFAULT_URL
 from tests import ROOT
-from tests.service.server import Server
 
 SOURCE = ROOT / "clients/python"
 SERVER = {"fastapi", "starlette", "pydantic", "torch", "scipy", "numba", "sqlalchemy", "uvicorn", "service", "lipcore"}
 SERVER |= {"pinocchio", "matplotlib", "pandas"}
 
 
-@pytest.fixture(scope="module")
-def server(tmp_path_factory):
-    """Service in a separate process."""
-    with Server(tmp_path_factory.mktemp("server"), warm=True) as started:
-        yield started
-
-
-def modules_of(package: Path) -> list[str]:
-    """Return the names of all modules of a package."""
-    parts = (each.relative_to(package.parent).with_suffix("").parts for each in sorted(package.rglob("*.py")))
-    return [".".join(each[:-1] if each[-1] == "__init__" else each) for each in parts]
-
-
 def test_client_imports_neither_service_nor_lipcore():
-    names = modules_of(SOURCE / "lipserve")
+    paths = [each.relative_to(SOURCE).with_suffix("") for each in sorted((SOURCE / "lipserve").rglob("*.py"))]
+    names = [".".join((path.parent if path.name == "__init__" else path).parts) for path in paths]
     assert "lipserve.records.jobs" in names
     script = f"import sys, json, {', '.join(names)}\nprint(json.dumps(sorted(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -73,20 +59,12 @@ def test_clients_use_address_and_key_of_the_environment(monkeypatch):
 
 
 @pytest.mark.slow
-def test_streams_use_the_address_of_the_environment(server, monkeypatch, tmp_path):
+def test_client_of_a_service_in_a_process_of_its_own(server, monkeypatch, tmp_path):
     zeros = [0.0] * 7
     monkeypatch.setenv("LIPSERVE_URL", server.url)
     with StreamClient("panda-sim") as stream, Client() as client:
         expected = client.predict("panda-sim", zeros, zeros, zeros).tau.tolist()
         assert stream.predict(zeros, zeros, zeros).tau.tolist() == pytest.approx(expected, abs=1e-12)
-    monkeypatch.setenv("LIPSERVE_URL", f"unix://{tmp_path}/none.sock")
-    with pytest.raises(StreamError, match=r"no service answers at .*none\.sock"):
-        StreamClient("panda-sim")
-
-
-@pytest.mark.slow
-def test_record_as_dict_equals_its_json(server):
-    with Client(server.url) as client:
         for record, path in (
             (client.model("panda-sim"), "/v1/models/panda-sim"),
             (client.version("panda-sim", 1), "/v1/models/panda-sim/versions/1"),
@@ -94,3 +72,6 @@ def test_record_as_dict_equals_its_json(server):
             (client.profile("panda"), "/v1/robots/profiles/panda"),
         ):
             assert record.as_dict() == server.client.get(path).json()
+    monkeypatch.setenv("LIPSERVE_URL", f"unix://{tmp_path}/none.sock")
+    with pytest.raises(StreamError, match=r"no service answers at .*none\.sock"):
+        StreamClient("panda-sim")

@@ -65,8 +65,7 @@ def test_evaluation_prints_as_a_table():
     ]
     html = found._repr_html_()
     assert html.endswith("<p>warning: 97 % repeat: &lt;flatters&gt;</p>")
-    assert "<caption>m&lt;b&gt; version 2" in html
-    assert "<td>1.23e-02</td>" in html
+    assert [part for part in ("<caption>m&lt;b&gt; version 2", "<td>1.23e-02</td>") if part not in html] == []
     first, second = found.rows()
     assert (first["joint"], first["nmse"], first["coverage"], second["rmse"]) == ("a", 0.0123, 0.94, 0.25)
     assert np.isnan(second["nmse"])
@@ -112,8 +111,7 @@ def test_trace_matches_measurements(local, trained):
     assert (found.samples, found.in_range, found.shown, found.in_training) == (80, 70, 20, True)
     np.testing.assert_allclose(found.tau, trained.samples.tau[found.rows])
     lower, upper = found.interval()
-    assert (lower < found.mean).all()
-    assert (upper > found.mean).all()
+    assert ((lower < found.mean) & (found.mean < upper)).all()
     assert found.components["friction"].mean.shape == (20, 2)
     assert local.trace(trained.name, trained.dataset, stop=5).mean.shape == (5, 2)
 
@@ -140,19 +138,13 @@ def test_lists_go_over_all_pages(strict):
 
 
 REVERSED = JOINTS[::-1]
-NAMES = {"joint_names": list(REVERSED), "joint_types": ["revolute"] * 7}
 
 
 def version(parameters, **given) -> Version:
-    nothing = ("training_range", "options", "fit", "compact", "calibration", "hyperparameters", "lineage")
     known = {"model": "m", "version": 1, "created_at": "2026-01-01T00:00:00+00:00", "job": None, "estimator": "lip"}
-    known |= {
-        **NAMES,
-        "torque_convention": "gravity_included",
-        "noise_std": [0.1] * 7,
-        "parameters": parameters,
-        "warnings": [],
-    }
+    known |= {"joint_names": list(REVERSED), "joint_types": ["revolute"] * 7, "torque_convention": "gravity_included"}
+    known |= {"noise_std": [0.1] * 7, "parameters": parameters, "warnings": []}
+    nothing = ("training_range", "options", "fit", "compact", "calibration", "hyperparameters", "lineage")
     return Version(**{**known, **{name: {} for name in nothing}, **given})
 
 
@@ -195,10 +187,6 @@ def test_text_and_html_show_every_joint_and_unidentifiable_parameters(arm):
     assert arm.as_dict()["frames"]["mode"] == "learn"
 
 
-def test_version_without_rigid_bodies_has_no_arm(robot):
-    assert read_arm(version({"friction": parameters_of(robot)["friction"]})) is None
-
-
 def test_stribeck_friction_is_shown_if_estimated(robot, arm):
     parameters = parameters_of(robot)
     parameters["friction"]["stribeck"] = {"mean": [float(k) for k in range(7)], "std": [0.01] * 7}
@@ -214,4 +202,5 @@ def test_version_prints_warnings_and_arm(robot):
     lines = str(known).splitlines()
     assert lines[:2] == [f"m version 1: rigid-body, 7 joints: {', '.join(REVERSED)}", "warning: joint 3 hardly moved"]
     assert str(known.arm) in str(known)
-    assert str(version({"friction": {}})).endswith(REVERSED[-1])
+    without = version({"friction": parameters_of(robot)["friction"]})
+    assert (read_arm(without), str(version({"friction": {}})).endswith(REVERSED[-1])) == (None, True)

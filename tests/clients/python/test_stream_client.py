@@ -100,22 +100,19 @@ def test_deadlines_are_reported(streaming):
             client.predict(*PAIR, deadline=1e-9)
         assert missed.value.code == "timeout"
         seen = [client.predict(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
-    assert [(answer.late, answer.late_answers) for answer in seen] == [(False, 1), (True, 2), (False, 2)]
-    assert [answer.sequence for answer in seen] == [2, 2, 4]  # the last that came in time
+    # the second is the last answer that came in time
+    assert list(map(lateness, seen)) == [(2, False, 1), (2, True, 2), (4, False, 2)]
     assert all(answer.seconds > 0 for answer in seen)
 
-
-def test_deadlines_are_those_of_the_client_that_is_awaited_too(streaming):
     async def ask():
         async with AsyncStreamClient("pendulum", streaming.server.url, timeout=DEADLINE) as client:
             return [await client.predict(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
 
-    seen = asyncio.run(ask())
-    assert [(answer.late, answer.late_answers, answer.sequence) for answer in seen] == [
-        (False, 0, 1),
-        (True, 1, 1),
-        (False, 1, 3),
-    ]
+    assert list(map(lateness, asyncio.run(ask()))) == [(1, False, 0), (1, True, 1), (3, False, 1)]
+
+
+def lateness(answer):
+    return answer.sequence, answer.late, answer.late_answers
 
 
 def test_ask_is_a_deprecated_name_of_predict(streaming):
@@ -133,20 +130,14 @@ def test_ask_is_a_deprecated_name_of_predict(streaming):
         assert (found.tau_std, place) == (None, __file__)
 
 
-def test_an_answer_that_was_on_its_way_for_too_long_is_late_though_the_service_was_quick(scripted):
+def test_answer_delayed_on_its_way_is_late(scripted):
     with scripted([answer(1)], [], [answer(2), answer(3)]) as server, server.client() as client:
-        first = client.predict(*MOTION, deadline=DEADLINE)
-        held = client.predict(*MOTION, deadline=0.01)
-        last = client.predict(*MOTION, deadline=DEADLINE)
-    assert [(each.sequence, each.late, each.late_answers) for each in (first, held, last)] == [
-        (1, False, 0),
-        (1, True, 1),
-        (3, False, 1),
-    ]
-    assert (held.tau.tolist(), last.tau.tolist()) == ([1.0], [3.0])
+        seen = [client.predict(*MOTION, deadline=deadline) for deadline in (DEADLINE, 0.01, DEADLINE)]
+    assert list(map(lateness, seen)) == [(1, False, 0), (1, True, 1), (3, False, 1)]
+    assert [each.tau.tolist() for each in seen[1:]] == [[1.0], [3.0]]
 
 
-def test_what_is_refused_names_the_field_and_the_next_is_answered(streaming):
+def test_rejected_frame_names_its_field_and_the_next_is_answered(streaming):
     with client_of(streaming) as client:
         with pytest.raises(StreamError, match=r"dq\[1\] is nan, expected a finite number") as refused:
             client.predict(PAIR[0], [0.0, np.nan], PAIR[2])
@@ -168,29 +159,27 @@ def test_what_is_refused_names_the_field_and_the_next_is_answered(streaming):
         ("m", {"unix": "/nobody.sock"}, r"no service answers at .*nobody\.sock", "unreachable"),
     ],
 )
-def test_a_stream_that_cannot_be_had_is_explained(streaming, model, options, message, code):
+def test_stream_that_cannot_be_opened_is_explained(streaming, model, options, message, code):
     with pytest.raises(StreamError, match=message) as refused:
         StreamClient(model, **{"url": streaming.server.url, **options})
     assert refused.value.code == code
 
 
-def test_a_service_that_closes_the_stream_is_quoted(scripted):
-    with scripted([CLOSE]) as server:
-        client = server.client()
+def test_reason_of_a_service_that_closes_the_stream_is_reported(scripted):
+    with scripted([CLOSE]) as server, server.client() as client:
         for _ in range(2):
             with pytest.raises(StreamError, match="the service closed the stream: the service stops") as gone:
                 client.predict(*MOTION)
             assert gone.value.code == "closed"
-        client.close()
 
 
-def test_a_layout_that_the_client_does_not_know_is_refused(scripted):
+def test_unknown_layout_is_rejected(scripted):
     with scripted(layout=2) as server, pytest.raises(StreamError, match="layout 2") as refused:
         server.client()
     assert refused.value.code == "layout"
 
 
-def test_an_answer_that_comes_too_late_is_not_taken_for_the_next(scripted):
+def test_late_answer_is_not_taken_for_the_next(scripted):
     with scripted([], [answer(1), answer(2)]) as server, server.client() as client:
         client.timeout = 0.01
         with pytest.raises(StreamError, match=r"no answer within 0.01 s") as missed:
@@ -202,7 +191,7 @@ def test_an_answer_that_comes_too_late_is_not_taken_for_the_next(scripted):
     assert len(server.requests) == 2
 
 
-def test_torque_goes_out_after_the_motion_with_its_flag(scripted):
+def test_torque_is_sent_after_the_motion_with_its_flag(scripted):
     with scripted([answer(1)], [answer(2)], [answer(3)]) as server, server.client() as client:
         client.predict(*MOTION, tau=[7.0])
         client.predict(*MOTION, std=False, deadline=0.5, tau=[8.0])
@@ -251,7 +240,7 @@ def test_flush_waits_for_the_last_torque_and_keeps_answers_for_later(scripted):
         assert [client.receive().sequence for _ in range(3)] == [3, 4, 5]
 
 
-def test_flush_gives_up_and_may_be_called_again(scripted):
+def test_flush_times_out_and_may_be_called_again(scripted):
     with scripted([answer(1)], [answer(2)], [learnt(2, 2), answer(3)]) as server, server.client() as client:
         client.predict(*MOTION, tau=[0.0])
         client.predict(*MOTION, tau=[0.0])
@@ -263,7 +252,7 @@ def test_flush_gives_up_and_may_be_called_again(scripted):
         assert client.receive().sequence == 3
 
 
-def test_a_client_goes_on_from_the_sequence_it_is_given(scripted):
+def test_client_continues_from_the_given_sequence(scripted):
     with scripted([answer(41), learnt(41, 0, 1)]) as server, server.client(first_sequence=41) as client:
         assert client.learnt.through == 40
         assert client.predict(*MOTION, tau=[0.0]).sequence == 41
@@ -271,27 +260,19 @@ def test_a_client_goes_on_from_the_sequence_it_is_given(scripted):
         server.script.append([answer(0)])
         with server.client(first_sequence=0) as other:
             assert other.predict(*MOTION).sequence == 0
+    for first in (-1, 2**32):
+        with pytest.raises(ValueError, match=rf"first_sequence is {first}, expected 0 to 4294967295"):
+            StreamClient("m", first_sequence=first)
 
 
-@pytest.mark.parametrize("first", [-1, 2**32])
-def test_a_first_sequence_that_is_none_is_refused(first):
-    with pytest.raises(ValueError, match=rf"first_sequence is {first}, expected 0 to 4294967295"):
-        StreamClient("m", first_sequence=first)
-
-
-def test_torque_needs_a_source_and_a_shape(scripted):
+def test_torque_needs_a_stream_id_and_a_shape(scripted):
+    shapes = r"\(1,\), \(1,\), \(1,\), \(2,\), expected \(n,\)"
     with scripted() as server:
-        with (
-            server.client(stream_id=None) as client,
-            pytest.raises(ValueError, match="`tau` has no effect"),
-        ):
+        with server.client(stream_id=None) as client, pytest.raises(ValueError, match="`tau` has no effect"):
             client.send(*MOTION, tau=[0.0])
         assert server.address == "/v1/models/m/stream"
-        with (
-            server.client() as client,
-            pytest.raises(ValueError, match=r"\(1,\), \(1,\), \(1,\), \(2,\), expected \(n,\)"),
-        ):
+        with server.client() as client, pytest.raises(ValueError, match=shapes):
             client.send(*MOTION, tau=[0.0, 1.0])
-        with server.client(version=2) as client:
+        with server.client(version=2):
             assert server.address == "/v1/models/m/stream?version=2&stream_id=arm-1"
     assert server.requests == []

@@ -14,6 +14,11 @@ def options_of_train(options):
     return ["--estimator", "lip-chain", *values]
 
 
+def lacking(text, *parts):
+    """Return the parts that a text does not contain."""
+    return [part for part in parts if part not in text]
+
+
 QUICKLY = options_of_train(QUICK)
 """Arguments of `lipserve train` for a fit that takes a fraction of a second."""
 
@@ -33,11 +38,17 @@ def lipserve(monkeypatch, capsys):
 
 
 @pytest.fixture
-def run_command(lipserve, server):
-    """Run a command against the shared service; return its output, with --json as parsed JSON."""
+def run_on_server(lipserve, server):
+    """Run a command against the shared service; return its exit code, output and error output."""
+    return lambda *arguments: lipserve(*arguments, "--url", server.url)
+
+
+@pytest.fixture
+def run_command(run_on_server):
+    """Run a command that succeeds; return its output, with --json as parsed JSON."""
 
     def run(*arguments):
-        code, out, err = lipserve(*arguments, "--url", server.url)
+        code, out, err = run_on_server(*arguments)
         assert code == 0, err
         return json.loads(out) if "--json" in arguments else out
 
@@ -45,11 +56,11 @@ def run_command(lipserve, server):
 
 
 @pytest.fixture
-def run_rejected_command(lipserve, server):
+def run_rejected_command(run_on_server):
     """Run a command that the shared service rejects; return its error output."""
 
     def run(*arguments):
-        code, out, err = lipserve(*arguments, "--url", server.url)
+        code, out, err = run_on_server(*arguments)
         assert (code, out.strip()) == (1, "")
         assert "error: " in err
         return err

@@ -45,9 +45,3 @@ def test_pages_have_a_space_before_the_percent_sign(page):
 @pytest.mark.parametrize("path", SHELL, ids=lambda path: path.stem)
 def test_commands_use_counted_for_numbers_of_things(path):
     assert MANY.findall(path.read_text("utf-8")) == []
-
-
-def test_report_uses_singular_and_plural(run_command, recording):
-    text = run_command("data", "add", recording(74, "counted.csv"))
-    assert "in 1 episode, at" in text
-    assert "; 0 gaps" in text

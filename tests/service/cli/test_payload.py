@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.service.cli.conftest import lacking
 from tests.service.learning.payloads import payload_batches
 from tests.service.models.versions import publish_arm_at
 
@@ -14,34 +15,35 @@ def carrier(server):
 
 
 def test_payload_is_declared_shown_and_removed(server, run_command, carrier):
-    assert f"no payload estimates of {carrier} yet" in run_command("payload", carrier)
+    payload = ("payload", carrier)
+    assert f"no payload estimates of {carrier} yet" in run_command(*payload)
     for stream_id in ("cell-1", "cell-2"):
         (first, *_) = payload_batches(stream_id, 0.0)
         assert server.client.post(f"/v1/models/{carrier}/observations", json=first).status_code == 200
-    declare = ("payload", carrier, "--mass", 1.5, "--com", "0,0.02,0.12")
-    text = run_command(*declare, "--stream", "cell-1")
-    for line in (
+    text = run_command(*payload, "--mass", 1.5, "--com", "0,0.02,0.12", "--stream", "cell-1")
+    parts = (
         "stream cell-1: payload 1.50 ± 0.03 kg, declared",
         "0.000 ± 0.005, 0.020 ± 0.005, 0.120 ± 0.005 m",
         "in the frame of the link after joint panda_joint7, as estimated",
         "kilograms are only as accurate as lengths",
-    ):
-        assert line in text
-    run_command("payload", carrier, "--mass", 12, "--com", "0,0,0.1", "--stream", "cell-2")
-    table = run_command("payload", carrier)
-    rows = [line for line in table.splitlines() if "cell-" in line]
-    assert [("1.50 ± 0.03 kg" in row, "12.00 ± 0.24 kg" in row) for row in rows] == [(True, False), (False, True)]
-    shown = run_command("payload", carrier, "--stream", "cell-2", "--json")
-    assert [each["stream_id"] for each in shown["streams"]] == ["cell-2"]
-    assert "stream cell-2: payload none" in run_command("payload", carrier, "--remove", "--stream", "cell-2")
-    assert run_command("payload", carrier, "--json")["streams"][0]["payload"]["mass"]["mean"] == pytest.approx(1.5)
-    assert f"declared for all streams of {carrier}: 2.00 ± 0.04 kg" in run_command(
-        "payload", carrier, "--mass", 2, "--com", "0,0,0.1", "--inertia", "0.01,0,0,0.01,0,0.01"
     )
-    assert "payload 2.00" in run_command("payload", carrier, "--stream", "cell-2")
-    run_command("payload", carrier, "--remove")
-    gone = run_command("payload", carrier, "--json")
+    assert lacking(text, *parts) == []
+    run_command(*payload, "--mass", 12, "--com", "0,0,0.1", "--stream", "cell-2")
+    rows = [line for line in run_command(*payload).splitlines() if "cell-" in line]
+    assert [("1.50 ± 0.03 kg" in row, "12.00 ± 0.24 kg" in row) for row in rows] == [(True, False), (False, True)]
+    shown = run_command(*payload, "--stream", "cell-2", "--json")
+    assert [each["stream_id"] for each in shown["streams"]] == ["cell-2"]
+    assert "stream cell-2: payload none" in run_command(*payload, "--remove", "--stream", "cell-2")
+    assert run_command(*payload, "--json")["streams"][0]["payload"]["mass"]["mean"] == pytest.approx(1.5)
+    text = run_command(*payload, "--mass", 2, "--com", "0,0,0.1", "--inertia", "0.01,0,0,0.01,0,0.01")
+    assert f"declared for all streams of {carrier}: 2.00 ± 0.04 kg" in text
+    assert "payload 2.00" in run_command(*payload, "--stream", "cell-2")
+    run_command(*payload, "--remove")
+    gone = run_command(*payload, "--json")
     assert (gone["default"], [each["payload"] for each in gone["streams"]]) == (None, [None, None])
+
+
+AT_ORIGIN = ("--mass", 1, "--com", "0,0,0")
 
 
 @pytest.mark.parametrize(
@@ -49,11 +51,8 @@ def test_payload_is_declared_shown_and_removed(server, run_command, carrier):
     [
         (("--mass", 1), "--mass and --com must be given together"),
         (("--remove", "--mass", 1), "give either --remove or --mass, not both"),
-        (
-            ("--mass", 1, "--com", "0,0,0", "--inertia", "1,2"),
-            "--inertia must be six numbers, ixx,ixy,ixz,iyy,iyz,izz; got 2",
-        ),
-        (("--mass", 1, "--com", "0,0,0", "--inertia", "9,0,0,1,0,1"), "No body has this mass and inertia"),
+        ((*AT_ORIGIN, "--inertia", "1,2"), "--inertia must be six numbers, ixx,ixy,ixz,iyy,iyz,izz; got 2"),
+        ((*AT_ORIGIN, "--inertia", "9,0,0,1,0,1"), "No body has this mass and inertia"),
         (("--mass", -1, "--com", "0,0,0"), "mass"),
     ],
 )

@@ -13,29 +13,34 @@ from lipserve.exchange import StreamAnswer, StreamRefusal
 from service.cli.playing import Tally, recorded, refused_figures
 from service.cli.simulate import app as simulating
 from service.cli.stream import app as streaming_app
+from tests.service.cli.conftest import lacking
 from tests.service.data import eventually, stream, train, upload
 
 
-def lines(text):
-    return [json.loads(line) for line in text.splitlines()]
+@pytest.fixture
+def play(run_on_server):
+    """Stream a simulated double pendulum to a model; return exit code, printed objects and error output."""
+
+    def run(model, *options):
+        code, out, err = run_on_server("stream", model, "--simulate", "double-pendulum", *options, "--json")
+        return code, [json.loads(line) for line in out.splitlines()], err
+
+    return run
 
 
 @pytest.mark.slow
-def test_simulated_robot_is_played_and_learnt(lipserve, server):
+def test_simulated_robot_is_played_and_learnt(play, server):
     train(server.client, "cli-taught", upload(server.client, stream())["id"])
-    code, out, err = lipserve(
-        *("stream", "cli-taught", "--simulate", "double-pendulum", "--seconds", 1.2, "--rate", 50, "--fast"),
-        *("--learn", "--stream-id", "cell", "--url", server.url, "--json"),
-    )
+    options = ("--seconds", 1.2, "--rate", 50, "--fast", "--learn", "--stream-id", "cell")
+    code, (*seconds, last), err = play("cli-taught", *options)
     assert code == 0, err
     assert "60 rows in 1.18 s (50 Hz) to cli-taught version 1, learning from stream cell" in err
-    *seconds, last = lines(out)
+    summary = last["summary"]
     assert [each["second"] for each in seconds] == [1, 2]
-    assert sum(each["rows"] for each in seconds) == last["summary"]["rows"] == 60
-    learnt = last["summary"]["learnt"]
-    assert learnt["accepted"] + sum(learnt["kept_out"].values()) == 60
-    assert [each["joint"] for each in last["summary"]["joints"]] == ["joint1", "joint2"]
-    assert last["summary"]["rmse"] > 0
+    assert sum(each["rows"] for each in seconds) == summary["rows"] == 60
+    assert summary["learnt"]["accepted"] + sum(summary["learnt"]["kept_out"].values()) == 60
+    assert [each["joint"] for each in summary["joints"]] == ["joint1", "joint2"]
+    assert summary["rmse"] > 0
     observed = server.client.get("/v1/models/cli-taught/observations", params={"stream_id": "cell"}).json()["items"]
     assert sum(each["rows"] for each in observed) == 60
 
@@ -59,36 +64,39 @@ def steady(server, arm):
 
 
 NUMBERS = count()
-PLAYED = ("--simulate", "double-pendulum", "--seconds", 1.5, "--rate", 100)
+PLAYED = ("--seconds", 1.5, "--rate", 100)
+OFF = (*PLAYED, "--viscous", 1, "--coulomb", 1)
+"""Options of a stream that fits, and of one that does not."""
 
 
 @pytest.mark.slow
-def test_misfitting_stream_is_reported_and_not_learnt(lipserve, server, steady):
+def test_misfitting_stream_is_reported_and_not_learnt(play, run_command, run_rejected_command, server, steady):
     before = server.client.post(f"/v1/models/{steady}/predict", json=QUERY).json()["tau"]
-    off = (*PLAYED, "--viscous", 1, "--coulomb", 1, "--url", server.url, "--json")
-    code, out, err = lipserve("stream", steady, *off, "--learn", "--stream-id", "other-arm")
-    assert code == 1
-    assert f"of the stream's first second is inside the 95 % interval of {steady}: learning is paused" in err
-    assert f"`lipserve learning decide {steady} ignore --replay`" in err
-    assert lines(out)[-1]["summary"]["learnt"]["kept_out"]["change"] > 0
-    alarm = json.loads(lipserve("alarms", steady, "--url", server.url, "--json")[1])[0]
+    code, printed, err = play(steady, *OFF, "--learn", "--stream-id", "other-arm")
+    parts = (
+        f"of the stream's first second is inside the 95 % interval of {steady}: learning is paused",
+        f"`lipserve learning decide {steady} ignore --replay`",
+    )
+    assert (code, lacking(err, *parts)) == (1, [])
+    assert printed[-1]["summary"]["learnt"]["kept_out"]["change"] > 0
+    alarm = run_command("alarms", steady, "--json")[0]
     assert "Stream other-arm does not fit the model: " in alarm["message"]
-    assert "learning is paused until you decide" in lipserve("learning", "show", steady, "--url", server.url)[1]
-    code, out, err = lipserve("stream", steady, *off, "--learn", "--stream-id", "another")
-    assert (code, f"learning of {steady} is paused: rows are stored but not learnt" in err) == (1, True)
-    assert f"of this stream's first second is inside the 95 % interval of {steady}, too" in err
-    assert "Learning is already paused" in lipserve("alarms", steady, "--url", server.url)[1]
+    assert "learning is paused until you decide" in run_command("learning", "show", steady)
+    code, _, err = play(steady, *OFF, "--learn", "--stream-id", "another")
+    parts = (
+        f"learning of {steady} is paused: rows are stored but not learnt",
+        f"of this stream's first second is inside the 95 % interval of {steady}, too",
+    )
+    assert (code, lacking(err, *parts)) == (1, [])
+    assert "Learning is already paused" in run_command("alarms", steady)
     seen = eventually(lambda: settled(server, steady))
     assert seen == pytest.approx(before, abs=1e-9)
-    code, out, err = lipserve("stream", steady, *off)
+    code, _, err = play(steady, *OFF)
     assert (code, "of the first second is inside the model's 95 % interval" in err) == (0, True)
-    code, out, err = lipserve("learning", "decide", steady, "ignore", "--replay", "--url", server.url)
-    assert (code, "learning resumed" in out) == (0, True)
-    assert "learning is active" in lipserve("learning", "show", steady, "--url", server.url)[1]
-    assert (
-        "the decision must be adapt or ignore, got 'go'"
-        in lipserve("learning", "decide", steady, "go", "--url", server.url)[2]
-    )
+    assert "learning resumed" in run_command("learning", "decide", steady, "ignore", "--replay")
+    assert "learning is active" in run_command("learning", "show", steady)
+    message = run_rejected_command("learning", "decide", steady, "go")
+    assert "the decision must be adapt or ignore, got 'go'" in message
 
 
 def settled(server, model):
@@ -102,65 +110,57 @@ QUERY = {"q": [0.3, -0.4], "dq": [0.5, 0.2], "ddq": [0.1, -0.3]}
 
 
 @pytest.mark.slow
-def test_misfitting_stream_is_learnt_with_yes_learn(lipserve, server, steady):
-    off = (*PLAYED, "--viscous", 1, "--coulomb", 1, "--url", server.url, "--json")
-    code, _, err = lipserve("stream", steady, *off, "--learn", "--yes-learn")
-    assert code == 0, err
-    assert "learning anyway (--yes-learn)" in err
-    assert (
-        json.loads(lipserve("learning", "show", steady, "--url", server.url, "--json")[1])["learning"]["status"]["held"]
-        is None
-    )
+def test_misfitting_stream_is_learnt_with_yes_learn(play, run_command, steady):
+    code, _, err = play(steady, *OFF, "--learn", "--yes-learn")
+    assert (code, "learning anyway (--yes-learn)" in err) == (0, True), err
+    assert run_command("learning", "show", steady, "--json")["learning"]["status"]["held"] is None
 
 
-def test_fitting_stream_is_learnt_without_warning(lipserve, server, steady):
-    code, out, err = lipserve("stream", steady, *PLAYED, "--url", server.url, "--json", "--learn")
+def test_fitting_stream_is_learnt_without_warning(play, run_command, steady):
+    code, printed, err = play(steady, *PLAYED, "--learn")
     assert (code, "interval" in err) == (0, False)
-    assert lines(out)[-1]["summary"]["learnt"]["accepted"] > 0
-    assert lipserve("alarms", steady, "--url", server.url)[1] == f"no alarms of {steady}\n"
+    assert printed[-1]["summary"]["learnt"]["accepted"] > 0
+    assert run_command("alarms", steady) == f"no alarms of {steady}\n"
 
 
 def test_recording_is_played(run_command, run_rejected_command, arm, recording):
     path = recording(85, "motion.csv", samples=20, rate=40.0)
     text = run_command("stream", arm[0], path)
-    assert "total   20 rows; round trip p50 " in text
-    assert " late, " in text
-    assert "(95 % interval)" in text
+    assert lacking(text, "total   20 rows; round trip p50 ", " late, ", "(95 % interval)") == []
     mismatch = "the motion has 2 joints (joint1, joint2), but the model has 7"
     assert mismatch in run_rejected_command("stream", "panda-sim", path)
 
 
-def test_ctrl_c_ends_stream_and_prints_figures(lipserve, arm, server, monkeypatch):
-    sent, send = [], StreamClient.send
+def close_stream():
+    raise StreamError("the service closed the stream: the service stops", "closed")
 
-    def send_and_interrupt(self, *arguments, **options):
+
+CLOSED = (
+    "error: the service closed the stream: the service stops (closed)",
+    "hint: open the stream again when the service is back",
+)
+
+
+@pytest.mark.parametrize(
+    ("end", "code", "rows", "parts"),
+    [(lambda: signal.raise_signal(signal.SIGINT), 130, 5, ()), (close_stream, 1, 4, CLOSED)],
+    ids=["Ctrl-C", "closed by the service"],
+)
+def test_ended_stream_prints_figures(play, arm, monkeypatch, end, code, rows, parts):
+    """The stream ends at its fifth row."""
+    sent, send, handler = [], StreamClient.send, signal.getsignal(signal.SIGINT)
+
+    def send_or_end(self, *arguments, **options):
         sent.append(arguments)
         if len(sent) == 5:
-            signal.raise_signal(signal.SIGINT)
+            end()
         return send(self, *arguments, **options)
 
-    monkeypatch.setattr(StreamClient, "send", send_and_interrupt)
-    before = signal.getsignal(signal.SIGINT)
-    code, out, _ = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
-    assert (code, len(sent)) == (130, 5)
-    assert lines(out)[-1]["summary"]["rows"] == 5
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_stream_closed_by_the_service_prints_figures(lipserve, arm, server, monkeypatch):
-    sent, send = [], StreamClient.send
-
-    def send_or_close(self, *arguments, **options):
-        sent.append(arguments)
-        if len(sent) == 5:
-            raise StreamError("the service closed the stream: the service stops", "closed")
-        return send(self, *arguments, **options)
-
-    monkeypatch.setattr(StreamClient, "send", send_or_close)
-    code, out, err = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
-    assert (code, lines(out)[-1]["summary"]["rows"]) == (1, 4)
-    assert "error: the service closed the stream: the service stops (closed)" in err
-    assert "hint: open the stream again when the service is back" in err
+    monkeypatch.setattr(StreamClient, "send", send_or_end)
+    result, printed, err = play(arm[0])
+    assert (result, len(sent), printed[-1]["summary"]["rows"]) == (code, 5, rows)
+    assert lacking(err, *parts) == []
+    assert signal.getsignal(signal.SIGINT) is handler
 
 
 def test_recordings_are_prepared_like_uploads(recording):
@@ -208,19 +208,14 @@ def test_latency_is_measured_over_stream_and_http(lipserve, streaming):
     code, out, err = lipserve("bench", *arguments)
     assert code == 0, err
     timed = json.loads(out)
-    assert timed["model"] == "pendulum"
+    assert (timed["model"], set(timed["milliseconds"])) == ("pendulum", {"stream", "HTTP"})
     for figures in timed["milliseconds"].values():
         assert 0 < figures["p50"] <= figures["p99"] <= figures["largest"]
-    assert set(timed["milliseconds"]) == {"stream", "HTTP"}
 
 
 def test_consecutive_refusals_for_one_reason_are_merged():
     off, full = ("busy", "too much waits"), ("storage_full", "the disk is full")
     given = [(1, 11, off), (12, 20, off), (21, 22, full), (30, 31, full), (32, 40, off)]
     told = refused_figures([StreamRefusal(first, through, *why, []) for first, through, why in given])
-    assert [(each["first"], each["through"], each["code"]) for each in told] == [
-        (1, 20, off[0]),
-        (21, 22, full[0]),
-        (30, 31, full[0]),
-        (32, 40, off[0]),
-    ]
+    merged = [(1, 20, off[0]), (21, 22, full[0]), (30, 31, full[0]), (32, 40, off[0])]
+    assert [(each["first"], each["through"], each["code"]) for each in told] == merged

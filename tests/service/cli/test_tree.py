@@ -15,6 +15,7 @@ from service.cli import consoles, options
 from service.cli.consoles import plain
 from service.cli.main import Commands
 from tests import ROOT
+from tests.service.cli.conftest import lacking
 from tests.service.server import free_port
 
 DOCS = ROOT / "docs"
@@ -34,8 +35,7 @@ def test_names_in_help_exist():
 def test_version_and_help(lipserve):
     assert lipserve("--version") == (0, f"{__version__}\n", "")
     code, out, _ = lipserve("--help")
-    assert code == 0
-    assert all(f"{command} " in out for command in Commands.entries)
+    assert (code, lacking(out, *(f"{command} " for command in Commands.entries))) == (0, [])
 
 
 def test_every_command_has_help_and_json_output():
@@ -51,13 +51,11 @@ def test_settings_are_listed_with_units_and_without_passwords(lipserve, monkeypa
     monkeypatch.setenv("LIPSERVE_DATABASE_URL", "postgresql://me:secret@host/name")
     monkeypatch.setenv("LIPSERVE_FILES_URL", "s3://bucket/prefix")
     code, out, _ = lipserve("settings")
-    assert (code, "secret" in out) == (0, False)
-    assert "LIPSERVE_PUBLISH_EVERY_S" in out
-    code, out, _ = lipserve("settings", "--json")
-    shown = {each["variable"]: each for each in json.loads(out)}
+    assert (code, "secret" in out, "LIPSERVE_PUBLISH_EVERY_S" in out) == (0, False, True)
+    shown = {each["variable"]: each for each in json.loads(lipserve("settings", "--json")[1])}
     assert shown["LIPSERVE_DATABASE_URL"]["value"] == "postgresql://me:***@host/name"
-    publish = {name: shown["LIPSERVE_PUBLISH_EVERY_S"][name] for name in ("value", "default", "unit")}
-    assert publish == {"value": "0.5", "default": "0.5", "unit": "s"}
+    publish = {"value": "0.5", "default": "0.5", "unit": "s"}
+    assert shown["LIPSERVE_PUBLISH_EVERY_S"].items() >= publish.items()
 
 
 @pytest.fixture
@@ -77,14 +75,14 @@ def completed(lipserve, monkeypatch):
 
 
 def test_commands_and_options_are_completed(completed):
-    assert completed("lipserve mo") == ["models"]
-    assert completed("lipserve models pro") == ["promote"]
-    assert completed("lipserve predict --comp") == ["--components"]
-    assert completed("lipserve train x.csv --estimator rigid") == [
-        "rigid-body",
-        "rigid-body+local",
-        "rigid-body+lip-chain",
-    ]
+    rigid = ["rigid-body", "rigid-body+local", "rigid-body+lip-chain"]
+    for line, completions in (
+        ("mo", ["models"]),
+        ("models pro", ["promote"]),
+        ("predict --comp", ["--components"]),
+        ("train x.csv --estimator rigid", rigid),
+    ):
+        assert completed(f"lipserve {line}") == completions
     assert "--queries" in completed("lipserve bench latency arm --qu")
     assert "latency" in completed("lipserve bench la")
 
@@ -100,15 +98,13 @@ def test_names_from_a_running_service_are_completed(completed, server, arm, monk
 
 
 def test_exit_codes(lipserve):
-    assert lipserve("data", "nonsense")[0] == 2
-    assert lipserve("predict", "m", "--nonsense")[0] == 2
-    assert lipserve("models", "promote", "m")[0] == 2
+    for line in ("data nonsense", "predict m --nonsense", "models promote m"):
+        assert lipserve(*line.split())[0] == 2, line
     assert "Did you mean 'train'" in lipserve("trian")[2]
-    nobody = f"http://127.0.0.1:{free_port()}"
-    for command in (["models", "list"], ["open"], ["stream", "m", "--simulate", "panda", "--seconds", "0.1"]):
-        code, out, err = lipserve(*command, "--url", nobody)
-        assert (code, out) == (1, "")
-        assert "lipserve serve" in err
+    for line in ("models list", "open", "status", "stream m --simulate panda --seconds 0.1"):
+        code, out, err = lipserve(*line.split(), "--url", f"http://127.0.0.1:{free_port()}")
+        start = "one" if line == "status" else ""
+        assert (code, out, f"{start} with `lipserve serve`" in err) == (1, "", True), line
 
 
 @pytest.mark.parametrize(
@@ -134,29 +130,24 @@ def test_invalid_arguments_are_explained_in_one_line(lipserve, tmp_path, monkeyp
     if command == "serve":
         monkeypatch.setenv("LIPSERVE_MAX_SAMPLES", "-5")
     code, out, err = lipserve(*command.split())
-    assert (code, out) == (1, "")
-    assert err.startswith("error: ")
+    assert (code, out, err.count("\n"), err[:7], list(tmp_path.iterdir())) == (1, "", 1, "error: ", [])
     assert message in err
-    assert err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
 
 
-def test_status_shows_parts_and_missing_extras(lipserve, run_command, server):
+def test_status_shows_parts_and_missing_extras(run_command, server):
     text, document = run_command("status"), run_command("status", "--json")
     assert f"{server.url} is ready: LIPServe {__version__}" in text
     assert [each["name"] for each in document["checks"]] == ["database", "home", "models", "learner", "training"]
     assert all(f"{each['name']} " in text and each["message"] in text for each in document["checks"])
     assert document["can"] == server.client.get("/health").json()["can"]
     assert text.count("not installed: pip install") == len(document["missing"])
-    code, out, err = lipserve("status", "--url", f"http://127.0.0.1:{free_port()}")
-    assert (code, out, "start one with `lipserve serve`" in err) == (1, "", True)
 
 
 def test_used_port_is_reported_before_the_home_is_created(lipserve, server, tmp_path, monkeypatch):
     monkeypatch.setenv("LIPSERVE_HOME", str(tmp_path / "home"))
     code, out, err = lipserve("serve", "--port", server.port)
-    assert (code, out) == (1, "")
-    assert f"error: Cannot listen on port {server.port} of 127.0.0.1: Address already in use" in err
+    message = f"error: Cannot listen on port {server.port} of 127.0.0.1: Address already in use"
+    assert (code, out, message in err) == (1, "", True)
     assert not (tmp_path / "home").exists()
 
 

@@ -1,7 +1,5 @@
 """Messages of the service with command line options instead of API fields."""
 
-import json
-
 import pytest
 import typer
 
@@ -23,6 +21,7 @@ SAID = {
     "holdout.share is 3.0, expected less": "--hold-out is 3.0, expected less",
     "units.q is foo, expected rad": "--unit q is foo, expected rad",
     "options.starts is 0, expected more": "--option starts is 0, expected more",
+    'units={"q": "deg", "t": "ms"}, drop_joints=a': "--unit q=deg --unit t=ms, --drop a",
 }
 
 
@@ -50,8 +49,3 @@ def test_every_upload_option_has_a_flag():
     command = next(each for each in typer.main.get_command(app).commands.values() if each.name == "add")
     options = {option for parameter in command.params for option in parameter.opts}
     assert {FLAGS[name] for name in Reading.__annotations__} <= options
-
-
-def test_several_fields_in_one_sentence():
-    text = f"units={json.dumps({'q': 'deg', 't': 'ms'})}, drop_joints=a"
-    assert in_shell(text) == "--unit q=deg --unit t=ms, --drop a"

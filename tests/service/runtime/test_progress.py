@@ -48,18 +48,13 @@ def test_process_without_steps_or_cpu_time_hangs():
     assert process.look_for(1) == "it has made no progress for 10 s"
 
 
-def test_computing_process_may_take_long_but_not_for_ever():
+@pytest.mark.parametrize("spent", [0.0, None], ids=["computing", "of unknown CPU time"])
+def test_process_may_take_long_but_not_for_ever(spent):
     process = WatchedProcess()
+    process.spent = spent
     assert process.look_for(99, busy=True) is None
     assert process.progress.silent_s == 0.0
     assert process.look_for(1, busy=True) == "one of its steps has taken 100 s"
-
-
-def test_only_steps_count_if_cpu_time_is_unknown():
-    process = WatchedProcess()
-    process.spent = None
-    assert process.look_for(99) is None
-    assert process.look_for(1) == "one of its steps has taken 100 s"
 
 
 def test_time_without_looks_does_not_count():

@@ -14,19 +14,19 @@ def ordered_floats(shard: int) -> np.ndarray:
 
 def kill_on_first_attempt(folder: str, shard: int) -> np.ndarray:
     """Return the same numbers, but kill the process in the first attempt at two of the shards."""
-    mark = os.path.join(folder, str(shard))
-    if shard in (3, 20) and not os.path.exists(mark):
-        open(mark, "w").close()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return ordered_floats(shard)
+    return _signal_on_first_attempt(signal.SIGKILL, folder, shard, (3, 20))
 
 
 def suspend_on_first_attempt(folder: str, shard: int) -> np.ndarray:
     """Return the same numbers, but suspend the process in the first attempt at one of the shards."""
+    return _signal_on_first_attempt(signal.SIGSTOP, folder, shard, (3,))
+
+
+def _signal_on_first_attempt(sent: signal.Signals, folder: str, shard: int, shards: tuple[int, ...]) -> np.ndarray:
     mark = os.path.join(folder, str(shard))
-    if shard == 3 and not os.path.exists(mark):
+    if shard in shards and not os.path.exists(mark):
         open(mark, "w").close()
-        os.kill(os.getpid(), signal.SIGSTOP)
+        os.kill(os.getpid(), sent)
     return ordered_floats(shard)
 
 

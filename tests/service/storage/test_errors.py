@@ -6,7 +6,7 @@ import shutil
 import sqlite3
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
@@ -24,7 +24,7 @@ from service.storage.database.engine import FILE
 from service.storage.errors import translate_error
 from service.storage.files import Files
 from service.storage.storage import HomeError, check_home
-from tests.service.data import ADDRESS, DEADLINE, arrays, error, npz, service_of, stream, upload
+from tests.service.data import ADDRESS, DEADLINE, arrays, error, npz, post, service_of, stream, upload
 from tests.service.robots.test_robots import urdf
 from tests.service.warm import Served
 from tests.system.faults.storage import small_disk
@@ -52,9 +52,16 @@ def statement_error(path: Path, *statements: str, mode: str = "rwc") -> DBAPIErr
 
 
 def locked_error(path: Path) -> DBAPIError:
+    with locked(path):
+        return statement_error(path, INSERT)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Lock a database for other writers."""
     with closing(sqlite3.connect(path, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
-        return statement_error(path, INSERT)
+        yield
 
 
 def damaged_error(path: Path) -> DBAPIError:
@@ -68,15 +75,15 @@ def no_database_error(path: Path) -> DBAPIError:
     return statement_error(path, SELECT)
 
 
+def full_error(path: Path) -> DBAPIError:
+    return statement_error(path, "PRAGMA max_page_count = 3", "INSERT INTO t VALUES (zeroblob(100000))")
+
+
 @pytest.mark.parametrize(
     ("fail", "expected", "words"),
     [
         (locked_error, StorageUnavailableError, "locked by another writer"),
-        (
-            lambda path: statement_error(path, "PRAGMA max_page_count = 3", "INSERT INTO t VALUES (zeroblob(100000))"),
-            StorageFullError,
-            "full",
-        ),
+        (full_error, StorageFullError, "full"),
         (damaged_error, StorageUnavailableError, "damaged"),
         (no_database_error, StorageUnavailableError, "damaged"),
         (lambda path: statement_error(path, INSERT, mode="ro"), StorageUnavailableError, "readonly"),
@@ -90,12 +97,6 @@ def test_database_errors_are_classified(tmp_path, fail: Callable, expected: type
     found = translate_error(fail(tmp_path / "database"))
     assert type(found) is (expected or type(None))
     assert found is None or words in found.message
-
-
-def test_device_without_space_is_a_full_disk():
-    with pytest.raises(OSError, match="No space left") as found, open("/dev/full", "wb", buffering=0) as file:
-        file.write(b"0")
-    assert type(translate_error(found.value)) is StorageFullError
 
 
 @pytest.mark.parametrize(
@@ -127,12 +128,11 @@ def service(tmp_path_factory) -> Iterator[TestClient]:
 
 
 def upload_dataset(api):
-    body = npz(**arrays(stream(samples=60)))
-    return api.post("/v1/datasets", content=body, headers={"content-type": "application/x-npz"})
+    return post(api, npz(**arrays(stream(samples=60))))
 
 
-def upload_robot(api):
-    return api.post("/v1/robots", content=urdf("late"), headers={"content-type": "application/xml"})
+def upload_robot(api, content=None):
+    return api.post("/v1/robots", content=content or urdf("late"), headers={"content-type": "application/xml"})
 
 
 def set_alias(api):
@@ -145,19 +145,15 @@ def assert_reads_work(api):
         assert api.get(path).status_code == 200
 
 
-def stored_files(api):
-    return [path for path in service_of(api).settings.home.glob("[du]*/*") if path.is_file()]
-
-
 def test_locked_database_gives_503_and_retry_after(service):
-    with closing(sqlite3.connect(service_of(service).settings.home / FILE, isolation_level=None)) as other:
-        other.execute("BEGIN IMMEDIATE")
+    with locked(service_of(service).settings.home / FILE):
         for request in (upload_dataset, upload_robot, set_alias):
             answer = request(service)
             error(answer, 503, "storage_unavailable")
             assert answer.headers["retry-after"] == "1"
         assert_reads_work(service)
-        assert stored_files(service) == []  # nothing of the rejected requests was stored
+        stored = [path for path in service_of(service).settings.home.glob("[du]*/*") if path.is_file()]
+        assert stored == []  # nothing of the rejected requests was stored
     for request, status in ((upload_dataset, 201), (upload_robot, 201), (set_alias, 200)):
         assert request(service).status_code == status
     for each in service.get("/v1/datasets").json()["items"]:
@@ -166,6 +162,7 @@ def test_locked_database_gives_503_and_retry_after(service):
 
 def test_full_database_gives_507_and_keeps_its_rows(service):
     engine = service_of(service).database.engine
+    large = urdf("large").replace(b"</robot>", b"<!--" + b"x" * 500_000 + b"--></robot>")  # many database pages
 
     def limit_pages(connection, *_):
         connection.execute("PRAGMA max_page_count = 1")
@@ -174,8 +171,7 @@ def test_full_database_gives_507_and_keeps_its_rows(service):
     try:
         with closing(sqlite3.connect(service_of(service).settings.home / FILE, isolation_level=None)) as other:
             other.execute("CREATE TABLE ballast (x)")
-        answers = [service.post("/v1/robots", content=_large_urdf(), headers={"content-type": "application/xml"})]
-        answers += [service.post("/v1/robots", content=_large_urdf(), headers={"content-type": "application/xml"})]
+        answers = [upload_robot(service, large) for _ in range(2)]
         error(answers[-1], 507, "storage_full")
         assert_reads_work(service)
     finally:
@@ -183,20 +179,15 @@ def test_full_database_gives_507_and_keeps_its_rows(service):
     with engine.connect() as connection:
         connection.execute(text("PRAGMA max_page_count = 1000000"))
     engine.dispose()
-    answer = service.post("/v1/robots", content=_large_urdf(), headers={"content-type": "application/xml"})
-    assert answer.status_code == 201
-
-
-def _large_urdf() -> bytes:
-    """Return a URDF that needs many database pages."""
-    return urdf("large").replace(b"</robot>", b"<!--" + b"x" * 500_000 + b"--></robot>")
+    assert upload_robot(service, large).status_code == 201
 
 
 def test_rejected_upload_leaves_nothing_on_a_full_disk(tmp_path):
     files = Files(tmp_path)
     (files.learning / "snap_1.draft").symlink_to("/dev/full")
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space left") as found:
         files.write_snapshot("snap_1", b"0" * 10_000)
+    assert type(translate_error(found.value)) is StorageFullError
     assert list(files.learning.iterdir()) == []
 
 
@@ -223,10 +214,8 @@ def test_service_does_not_start_on_a_later_database(tmp_path):
 def test_service_does_not_start_while_the_database_stays_locked(tmp_path, monkeypatch):
     monkeypatch.setattr("service.storage.storage.WAIT_S", 0.1)
     Database(tmp_path).close()
-    with closing(sqlite3.connect(tmp_path / FILE, isolation_level=None)) as other:
-        other.execute("BEGIN IMMEDIATE")
-        with pytest.raises(HomeError, match="database is locked"):
-            check_home(Settings(home=tmp_path))
+    with locked(tmp_path / FILE), pytest.raises(HomeError, match="database is locked"):
+        check_home(Settings(home=tmp_path))
     check_home(Settings(home=tmp_path))
 
 
@@ -241,8 +230,7 @@ def test_failed_start_is_explained(tmp_path):
 
 @pytest.mark.own_files("the home of a service that others share holds next to nothing")
 @pytest.mark.parametrize("gone", ["the home", "all but the database"])
-def test_deleted_home_is_a_storage_failure(tmp_path, monkeypatch, gone):
-    home = tmp_path / "home"
+def test_deleted_home_is_a_storage_failure(home, tmp_path, monkeypatch, gone):
     monkeypatch.setattr(Weighing, "expect", lambda self: None)  # a starting process would create its folders again
     with TestClient(create_app(Settings(home=home)), ADDRESS, raise_server_exceptions=False) as api:
         dataset = upload(api, stream())["id"]
@@ -255,17 +243,13 @@ def test_deleted_home_is_a_storage_failure(tmp_path, monkeypatch, gone):
             api.get(f"/v1/datasets/{dataset}/preview"),
             api.get("/v1/models/panda-sim/export"),
             api.post("/v1/models/import", content=bytes(2048), headers={"content-type": "application/x-tar"}),
-            api.post("/v1/datasets", content=npz(**body), headers={"content-type": "application/x-npz"}),
+            post(api, npz(**body)),
         ]
         if gone == "the home":
-            observation = {
-                "stream_id": "s",
-                "sequence": 1,
-                "t": [0.0],
-                **{name: [[0.0] * 7] for name in (*ZERO, "tau")},
-            }
+            rows = {name: [[0.0] * 7] for name in (*ZERO, "tau")}
+            observation = {"stream_id": "s", "sequence": 1, "t": [0.0], **rows}
             answers.append(api.post("/v1/models/panda-sim/observations", json=observation))
-            answers.append(api.post("/v1/robots", content=urdf(), headers={"content-type": "application/xml"}))
+            answers.append(upload_robot(api))
             answers.append(api.get("/metrics"))
         for each in answers:
             error(each, 503, "storage_unavailable")

@@ -10,31 +10,23 @@ from tests.service.api.stream.test_session import FakeModel, FakeVersions, answe
 from tests.service.streams import LATE, frame
 
 
-def test_duration_counts_up_to_its_bucket_bound():
+def test_durations_count_up_to_their_bucket_bound_also_merged():
     durations = Durations((0.1, 1.0))
     for seconds in (0.0, 0.1, 0.1000001, 1.0, 5.0):
         durations.add(seconds)
-    assert durations.counts == [2, 2, 1]
-    assert durations.total == pytest.approx(6.2000001)
-
-
-def test_merged_durations_equal_all_durations():
+    assert (durations.counts, durations.total) == ([2, 2, 1], pytest.approx(6.2000001))
     one, two = Durations(), Durations()
-    one.add(BUCKET_BOUNDS_S[0])
-    two.add(BUCKET_BOUNDS_S[0])
-    two.add(1e9)
+    for part, seconds in ((one, BUCKET_BOUNDS_S[0]), (two, BUCKET_BOUNDS_S[0]), (two, 1e9)):
+        part.add(seconds)
     both = merge_durations([one, two])
     assert (both.counts[0], both.counts[-1], both.total) == (2, 1, pytest.approx(1e9))
 
 
-def test_models_beyond_the_max_share_a_label():
+def test_models_beyond_the_max_share_a_label_of_requests_and_streams():
     meter = RequestMeter(most_models=2)
     for name in ("a", "b", "c", "d", "a", ""):
         meter.find(Kind("GET", "/r", name, 200, ""), exists=True).add(0.1)
     assert {kind[2]: sum(each.counts) for kind, each in meter.known.items()} == {"a": 2, "b": 1, OTHER: 2, "": 1}
-
-
-def test_streams_and_requests_share_model_labels():
     meters = Meters(most_models=1)
     meters.requests.find(Kind("GET", "/r", "a", 200, ""), exists=True)
     assert meters.stream("b") is meters.stream("c")

@@ -47,6 +47,18 @@ def clock():
 
 
 @pytest.fixture
+def set_learner(monkeypatch):
+    """Return a function that sets figures of the learner process, which is needed and runs."""
+
+    def set_figures(**figures):
+        for name, value in figures.items():
+            monkeypatch.setattr(LearnerProcess, name, value)
+
+    set_figures(is_needed=True, pid=1)
+    return set_figures
+
+
+@pytest.fixture
 def check_readiness(clock):
     """Check the parts of a service without its cache; return their states."""
     kept = {}
@@ -60,16 +72,22 @@ def check_readiness(clock):
 
 
 def test_every_part_and_its_failure_are_named(api, fresh_readiness, monkeypatch):
+    service = service_of(api)
     answer = api.get("/health/ready")
     assert answer.status_code == 200, answer.text
     assert (answer.json()["status"], answer.json()["version"]) == ("ready", __version__)
     assert [part["name"] for part in answer.json()["checks"] if part["name"] != "files"] == PARTS
-    service_of(api).readiness.forget()
-    monkeypatch.setattr(service_of(api).disk, "floor", 2**62)
-    refusal = error(api.get("/health/ready"), 503, "not_ready")
-    assert [item["field"] for item in refusal["detail"]] == ["home"]
+    for owner, name, value, field in (
+        (service.stopping, "begun", True, "stopping"),
+        (service.disk, "floor", 2**62, "home"),
+    ):
+        service.readiness.forget()
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, value)
+            refusal = error(api.get("/health/ready"), 503, "not_ready")
+            assert api.get("/health/live").json() == {"status": "alive"}
+        assert [item["field"] for item in refusal["detail"]] == [field]
     assert "LIPSERVE_MIN_FREE_BYTES" in refusal["message"]
-    assert api.get("/health/live").json() == {"status": "alive"}
 
 
 @pytest.mark.own_files("locks the file of the database")
@@ -79,7 +97,6 @@ def test_locked_database_is_reported(api, check_readiness, monkeypatch):
     with closing(sqlite3.connect(service.database.engine.url.database, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         assert check_readiness(service)["database"] == ("failed", "OperationalError: database is locked")
-        other.execute("ROLLBACK")
     assert check_readiness(service)["database"][0] == "ok"
 
 
@@ -91,10 +108,8 @@ def test_unwritable_home_is_reported_without_its_path(api, check_readiness, monk
     assert "gone" not in message  # this route needs no key
 
 
-def test_check_and_scrape_do_not_count_as_uses_of_a_version(api, trained, check_readiness, monkeypatch):
+def test_check_and_scrape_do_not_count_as_uses_of_a_version(api, trained, check_readiness, set_learner, monkeypatch):
     service = service_of(api)
-    monkeypatch.setattr(LearnerProcess, "is_needed", True)
-    monkeypatch.setattr(LearnerProcess, "pid", 1)
     service.learners.monitor(trained.name)  # a version with an alias is checked
     files, uses = list(service.files.uploads.iterdir()), VersionUses(service.loaded._clock)
     monkeypatch.setattr(service.loaded, "_clock", uses)
@@ -121,48 +136,34 @@ def test_unreadable_version_is_a_warning_while_others_work(api, trained, check_r
     assert check_readiness(service)["models"][0] == "failed"
 
 
-def test_missing_learner_is_reported_after_a_while(api, check_readiness, clock, monkeypatch):
+def test_missing_or_hanging_learner_is_reported_after_a_while(api, check_readiness, clock, set_learner):
     service = service_of(api)
-    monkeypatch.setattr(LearnerProcess, "is_needed", True)
-    monkeypatch.setattr(LearnerProcess, "pid", None)
-    assert check_readiness(service)["learner"][0] == "warning"
-    clock.now += RESTART_S
-    assert check_readiness(service)["learner"][0] == "warning"
-    clock.now += 1.0
-    assert check_readiness(service)["learner"][0] == "failed"
-    monkeypatch.setattr(LearnerProcess, "pid", 1)
+    set_learner(pid=None)
+    for seconds, state in ((0.0, "warning"), (RESTART_S, "warning"), (1.0, "failed")):
+        clock.now += seconds
+        assert check_readiness(service)["learner"][0] == state
+    set_learner(pid=1)
     assert check_readiness(service)["learner"] == ("ok", "runs")
-    monkeypatch.setattr(LearnerProcess, "pid", None)
+    set_learner(pid=None)
     assert check_readiness(service)["learner"][0] == "warning"  # missing again
-
-
-def test_hanging_learner_is_reported(api, check_readiness, monkeypatch):
-    service = service_of(api)
-    monkeypatch.setattr(LearnerProcess, "is_needed", True)
-    monkeypatch.setattr(LearnerProcess, "pid", 1)
-    monkeypatch.setattr(LearnerProcess, "silent_s", RESTART_S)
+    set_learner(pid=1, silent_s=RESTART_S)
     assert check_readiness(service)["learner"] == ("ok", "runs")
-    monkeypatch.setattr(LearnerProcess, "silent_s", 44.0)
+    set_learner(silent_s=44.0)
     message = "has made no progress for 44 s: observations are stored, but not learnt"
     assert check_readiness(service)["learner"] == ("failed", message)
 
 
-def test_observations_that_wait_long_are_reported(api, trained, check_readiness, clock, monkeypatch):
-    service = service_of(api)
-    learners, limit = service.learners, MAX_LAG_S
-    monkeypatch.setattr(LearnerProcess, "is_needed", True)
-    monkeypatch.setattr(LearnerProcess, "pid", 1)
+def test_observations_that_wait_long_are_reported(api, trained, check_readiness, clock, set_learner, monkeypatch):
+    service, limit, newest = service_of(api), MAX_LAG_S, 57
     service.loaded.get(trained.name, None)
-    monkeypatch.setattr(learners, "monitors", lambda: {trained.name: None})
-    newest = 57
+    monkeypatch.setattr(service.learners, "monitors", lambda: {trained.name: None})
     monkeypatch.setattr(log, "newest", lambda session, model: newest)
-    assert check_readiness(service)["learner"] == ("ok", "runs")  # they have just arrived
-    clock.now += 1.0
-    assert check_readiness(service)["learner"] == ("ok", "runs")
+    for seconds in (0.0, 1.0):  # they have just arrived
+        clock.now += seconds
+        assert check_readiness(service)["learner"] == ("ok", "runs")
     clock.now += limit + 1.0
-    state, message = check_readiness(service)["learner"]
-    assert state == "warning"
-    assert message == f"runs, but 57 events are waiting and none was learnt for {limit + 1.0:.0f} s"
+    message = f"runs, but 57 events are waiting and none was learnt for {limit + 1.0:.0f} s"
+    assert check_readiness(service)["learner"] == ("warning", message)
     newest = 0
     assert check_readiness(service)["learner"] == ("ok", "runs")
 
@@ -177,17 +178,10 @@ def test_jobs_that_nobody_starts_are_reported(no_worker, check_readiness, clock)
     assert check_readiness(service)["training"][0] == "ok"
 
 
-def test_stopping_service_is_not_ready(api, monkeypatch):
-    monkeypatch.setattr(service_of(api).stopping, "begun", True)
-    refusal = error(api.get("/health/ready"), 503, "not_ready")
-    assert [item["field"] for item in refusal["detail"]] == ["stopping"]
-
-
 def test_report_is_cached_briefly(api, clock):
     looked = []
-    seen = Readiness(
-        {"home": lambda lasting: looked.append(1) or ("ok", "")}, service_of(api).stopping, lambda: clock.now
-    )
+    probes = {"home": lambda lasting: looked.append(1) or ("ok", "")}
+    seen = Readiness(probes, service_of(api).stopping, clock)
     for _ in range(5):
         seen.report()
     assert len(looked) == 1

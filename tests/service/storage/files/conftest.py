@@ -2,19 +2,28 @@
 
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pytest
 
 from service.storage.files import Files
 from tests.choosing import slow
+from tests.service.data import stream
 from tests.system.cluster import conftest as cluster
 from tests.system.cluster.servers import BUCKET, S3
 
 s3 = cluster.s3
 _prefixes = count(1)
+
+
+def put(files: Files, dataset: str = "ds_one", **options: Any) -> str:
+    """Store a recording as a data set; return its checksum."""
+    samples = stream(**{"samples": 10, **options})
+    return files.write_samples(dataset, len(samples), samples.n_joints, partial(getattr, samples))
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import errno
 import os
 import pickle
 import threading
-from functools import partial
+from unittest.mock import Mock
 
 import pytest
 
@@ -13,37 +13,27 @@ from service.foundation.settings import Settings
 from service.storage import errors as storage_errors
 from service.storage.files import Files, FilesUnreachableError, objects
 from service.storage.storage import HomeError, check_home
-from tests.service.data import stream
+from tests.service.storage.files.conftest import put
 
 pytestmark = pytest.mark.slow  # needs S3
 
 
-def put(files, dataset="ds_one"):
-    samples = stream(samples=10)
-    return files.write_samples(dataset, len(samples), samples.n_joints, partial(getattr, samples))
-
-
-def operations(files):
-    """Return all operations that need the store."""
-    return {
-        "write": lambda: put(files, "ds_two"),
-        "read": lambda: files.samples_file("ds_else", "0" * 64),
-        "snapshot": lambda: files.read_snapshot("snap_else"),
-        "load": lambda: files.load_version("mv_else", None),
-        "versions": lambda: files.versions_marked("job"),
-        "sweep": lambda: files.sweep(set(), set(), set()),
-        "check": files.check,
-    }
-
-
 def error_messages(files):
-    """Return the error of each operation."""
-    found = {}
-    for name, operation in operations(files).items():
+    """Return the errors of all operations that need the store."""
+    messages = []
+    for operation in (
+        lambda: put(files, "ds_two"),
+        lambda: files.samples_file("ds_else", "0" * 64),
+        lambda: files.read_snapshot("snap_else"),
+        lambda: files.load_version("mv_else", None),
+        lambda: files.versions_marked("job"),
+        lambda: files.sweep(set(), set(), set()),
+        files.check,
+    ):
         with pytest.raises(FilesUnreachableError) as caught:
             operation()
-        found[name] = str(caught.value)
-    return found
+        messages.append(str(caught.value))
+    return messages
 
 
 @pytest.fixture
@@ -60,8 +50,7 @@ def test_unreachable_endpoint_is_detected_and_its_return_too(s3, bucket, tmp_pat
     digest = put(files)
     s3.stop()
     try:
-        messages = error_messages(files)
-        assert all("does not answer" in each for each in messages.values())
+        assert all("does not answer" in each for each in error_messages(files))
         assert files.samples_file("ds_one", digest).exists()
         files.delete_samples("ds_one")  # the copy is swept later
     finally:
@@ -71,15 +60,23 @@ def test_unreachable_endpoint_is_detected_and_its_return_too(s3, bucket, tmp_pat
 
 
 def test_missing_bucket_does_not_make_data_lost(bucket, tmp_path, single_attempt):
-    messages = error_messages(Files(tmp_path, "s3://nobody-has-this/files"))
-    assert all("bucket" in each for each in messages.values()), messages
+    assert all("bucket" in each for each in error_messages(Files(tmp_path, "s3://nobody-has-this/files")))
 
 
 def test_unmounted_folder_is_not_created(tmp_path):
     root = tmp_path / "mounted"
-    messages = error_messages(Files(tmp_path / "home", root.as_uri()))
-    assert all("is it mounted?" in each for each in messages.values())
+    assert all("is it mounted?" in each for each in error_messages(Files(tmp_path / "home", root.as_uri())))
     assert not root.exists()
+
+
+@pytest.fixture
+def fail_requests(monkeypatch):
+    """Return a function that lets a request of the S3 library fail."""
+
+    def fail(files, name, error):
+        monkeypatch.setattr(files._place.objects._system, name, Mock(side_effect=error))
+
+    return fail
 
 
 @pytest.mark.parametrize(
@@ -90,26 +87,18 @@ def test_unmounted_folder_is_not_created(tmp_path):
         (OSError(errno.EIO, "Reduce your rate"), "refuses"),
     ],
 )
-def test_bucket_error_is_reported_without_secrets(bucket, tmp_path, monkeypatch, raised, words):
+def test_bucket_error_is_reported_without_secrets(bucket, tmp_path, fail_requests, raised, words):
     files = Files(tmp_path, bucket)
-
-    def refuse(*_, **__):
-        raise raised
-
-    monkeypatch.setattr(files._place.objects._system, "put_file", refuse)
+    fail_requests(files, "put_file", raised)
     with pytest.raises(FilesUnreachableError, match=words) as caught:
         put(files)
     assert "secret" not in str(caught.value)
 
 
-def test_full_cache_disk_is_reported(bucket, tmp_path, monkeypatch):
+def test_full_cache_disk_is_reported(bucket, tmp_path, fail_requests):
     digest = put(Files(tmp_path / "one", bucket))
     files = Files(tmp_path / "other", bucket)
-
-    def full(*_, **__):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(files._place.objects._system, "get_file", full)
+    fail_requests(files, "get_file", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     with pytest.raises(OSError, match="No space left") as caught:
         files.samples_file("ds_one", digest)
     assert isinstance(storage_errors.translate_error(caught.value), StorageFullError)
