@@ -36,7 +36,7 @@ def warm_up(*names: str) -> None:
     that is not one of COMPILED_ESTIMATORS.
     """
     if unknown := [name for name in names if name not in COMPILED_ESTIMATORS]:
-        raise ValueError(f"{unknown[0]!r} is not a compiled estimator, expected only {', '.join(COMPILED_ESTIMATORS)}")
+        raise ValueError(f"{unknown[0]!r} is not a compiled estimator. Compiled are {', '.join(COMPILED_ESTIMATORS)}")
     for name in names or COMPILED_ESTIMATORS:
         model = train(_swinging(), ("revolute", "revolute"), name, FASTEST_OPTIONS)
         model.warm_up()

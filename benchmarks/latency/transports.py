@@ -51,7 +51,7 @@ Answer = tuple[Array, Array | None]
 
 
 def floors(names: Iterable[str], loop: str) -> set[str]:
-    """Return what the named subjects need besides themselves: echoes; for the control loop, stream and echo."""
+    """Return the subjects to measure beside the named ones: their echoes; for the control loop, stream and echo."""
     needed = {_FLOORS[name] for name in names if name in _FLOORS}
     return needed | ({"ws", "echo-ws"} if loop in names else set())
 

@@ -16,7 +16,7 @@ from benchmarks.real.splits import Split
 from benchmarks.workload import BenchError
 from lipcore.data.metrics import LEVEL, evaluate, quantile
 
-Told = Literal["nothing", "URDF"]
+Knowledge = Literal["nothing", "URDF"]
 """What a method knows of the robot besides the samples and the joint types."""
 PRODUCT = "LIPServe"
 """Method: the service with default options."""
@@ -31,11 +31,11 @@ class Cell(BaseModel):
 
     recording: str
     split: str
-    told: Told
+    knowledge: Knowledge
     method: str
 
     def __str__(self) -> str:
-        return f"{self.recording}/{self.split}/{self.told}/{self.method}"
+        return f"{self.recording}/{self.split}/{self.knowledge}/{self.method}"
 
 
 class Result(BaseModel):
@@ -127,7 +127,12 @@ class Cache:
 
     def _path(self, cell: Cell) -> Path:
         revision = f"@{self.revision}" if cell.method == PRODUCT else ""
-        return self.folder / cell.recording / cell.split / f"{cell.method}-{cell.told}{revision}.json".replace(" ", "-")
+        return (
+            self.folder
+            / cell.recording
+            / cell.split
+            / f"{cell.method}-{cell.knowledge}{revision}.json".replace(" ", "-")
+        )
 
 
 def product_revision() -> str:

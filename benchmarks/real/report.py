@@ -10,13 +10,13 @@ import numpy as np
 from benchmarks.latency import table
 from benchmarks.latency.table import NOTHING, Grid
 from benchmarks.latency.targets import Target
-from benchmarks.real.cells import PRODUCT, Result, Told
+from benchmarks.real.cells import PRODUCT, Knowledge, Result
 from benchmarks.real.running import ALONE, WITH_BODY, Outcome
 from benchmarks.real.splits import EARLY, GUARD_S, MAX_TEST_ROWS
 
 TEN_S = 9.4
 """Min duration of ten seconds of training; preparation cuts half a second off a recording."""
-LIMITS: Mapping[tuple[str, str], tuple[str, Mapping[Told, float]]] = {
+LIMITS: Mapping[tuple[str, str], tuple[str, Mapping[Knowledge, float]]] = {
     ("panda-9s", EARLY): ("panda-9s, its last 30 %", {"nothing": 2e-2, "URDF": 1.3e-2}),
     ("panda-9s", "other"): ("panda-9s, other motion", {"nothing": 1.6e-2, "URDF": 1.3e-2}),
     ("kuka", "other"): ("kuka, other motion", {"nothing": 1.4e-1}),
@@ -26,14 +26,14 @@ MIN_COVERAGE = 0.85
 """Min coverage of a joint's 95 % interval."""
 MAX_OF_MEAN = 1.05
 """Max error / error of the recording's mean."""
-KNOWN: Mapping[Told, str] = {"nothing": "no URDF", "URDF": "URDF"}
+KNOWLEDGE_TITLES: Mapping[Knowledge, str] = {"nothing": "no URDF", "URDF": "URDF"}
 """Names in the tables of what a method knows."""
 
-EITHER: tuple[Told, ...] = ("nothing", "URDF")
-UNTOLD: tuple[Told, ...] = ("nothing",)
+EITHER: tuple[Knowledge, ...] = ("nothing", "URDF")
+WITHOUT_URDF: tuple[Knowledge, ...] = ("nothing",)
 Split = tuple[str, str]
 """Names of recording and split."""
-Column = tuple[str, Told]
+Column = tuple[str, Knowledge]
 COLUMNS: Sequence[Column] = (
     *((PRODUCT, "nothing"), (PRODUCT, "URDF")),
     *((method, "nothing") for method in ALONE),
@@ -50,16 +50,16 @@ class Summary:
         self.rows: dict[Split, dict[Column, Result]] = {}
         for result in self.results:
             row = self.rows.setdefault((result.cell.recording, result.cell.split), {})
-            row[result.cell.method, result.cell.told] = result
+            row[result.cell.method, result.cell.knowledge] = result
 
     def product(self) -> list[Result]:
         """Return the results of LIPServe."""
         return [each for each in self.results if each.cell.method == PRODUCT]
 
-    def ratio(self, result: Result, told: tuple[Told, ...] = EITHER) -> float | None:
+    def ratio(self, result: Result, knowledge: tuple[Knowledge, ...] = EITHER) -> float | None:
         """Return the error / error of the best other method with this knowledge; None without any."""
         row = self.rows[result.cell.recording, result.cell.split]
-        rivals = [each.error for (method, known), each in row.items() if method != PRODUCT and known in told]
+        rivals = [each.error for (method, known), each in row.items() if method != PRODUCT and known in knowledge]
         return result.error / min(rivals) if rivals else None
 
 
@@ -67,10 +67,10 @@ def targets(results: Iterable[Result]) -> list[Target]:
     """Return all targets."""
     summary = Summary(results)
     everything = summary.product()
-    ratios: defaultdict[tuple[Told, bool], list[float]] = defaultdict(list)
+    ratios: defaultdict[tuple[Knowledge, bool], list[float]] = defaultdict(list)
     for each in everything:
         if (ratio := summary.ratio(each)) is not None:
-            ratios[each.cell.told, each.train_s >= TEN_S].append(ratio)
+            ratios[each.cell.knowledge, each.train_s >= TEN_S].append(ratio)
     long, of_mean = ratios["URDF", True], "error / error of the recording's mean"
     found = [
         Target("no URDF, at least 10 s: largest error / best other", _max(ratios["nothing", True]), "×", "≤", 2.0),
@@ -81,10 +81,10 @@ def targets(results: Iterable[Result]) -> list[Target]:
         Target(f"worst joint: {of_mean}", _max([each.worst for each in everything]), "×", "≤", MAX_OF_MEAN),
     ]
     for split, (name, limits) in LIMITS.items():
-        for told, limit in limits.items():
-            result = summary.rows.get(split, {}).get((PRODUCT, told))
+        for knowledge, limit in limits.items():
+            result = summary.rows.get(split, {}).get((PRODUCT, knowledge))
             error = None if result is None else result.error
-            found.append(Target(f"{name}, {KNOWN[told]}", error, "nMSE", "≤", limit))
+            found.append(Target(f"{name}, {KNOWLEDGE_TITLES[knowledge]}", error, "nMSE", "≤", limit))
     covered = [100.0 * (each >= MIN_COVERAGE) for result in everything for each in result.coverage]
     widths = [each for result in everything for each in result.width]
     return [
@@ -117,7 +117,9 @@ def errors(summary: Summary) -> Grid:
         cells = (row.get(column) for column in COLUMNS)
         figures = (NOTHING if each is None else _power(each.error) for each in cells)
         rows.append((f"{recording}, {split}", f"{learnt:.1f}", *figures))
-    heads = (f"{method}, {KNOWN[told]}" if method == PRODUCT else method for method, told in COLUMNS)
+    heads = (
+        f"{method}, {KNOWLEDGE_TITLES[knowledge]}" if method == PRODUCT else method for method, knowledge in COLUMNS
+    )
     title = "nMSE, mean over the joints; least squares and the methods after it know the URDF"
     return Grid(title, ("recording, test", "training s", *heads), rows)
 
@@ -128,13 +130,13 @@ def details(summary: Summary) -> Grid:
     for each in summary.product():
         rows.append(
             (
-                f"{each.cell.recording}, {each.cell.split}, {KNOWN[each.cell.told]}",
+                f"{each.cell.recording}, {each.cell.split}, {KNOWLEDGE_TITLES[each.cell.knowledge]}",
                 " ".join(map(_power, each.nmse)),
                 " ".join(f"{100 * value:.0f}" for value in each.coverage),
                 f"{np.median(each.width):.1f}",
                 f"{each.worst:.2g}",
                 _times(summary.ratio(each)),
-                _times(summary.ratio(each, UNTOLD)),
+                _times(summary.ratio(each, WITHOUT_URDF)),
                 f"{each.seconds:.0f}",
                 each.estimator,
             )
@@ -158,7 +160,9 @@ def methods(summary: Summary) -> Grid:
         width = np.median([value for each in results for value in each.width])
         times = [each.seconds for each in results]
         figures = (f"{100 * covered:.0f}", f"{width:.1f}", f"{np.median(times):.1f}", f"{max(times):.1f}")
-        rows.append((f"{column[0]}, {KNOWN[column[1]]}", *figures, f"{best.count(column)} of {len(results)}"))
+        rows.append(
+            (f"{column[0]}, {KNOWLEDGE_TITLES[column[1]]}", *figures, f"{best.count(column)} of {len(results)}")
+        )
     heads = ("method", "joints covered 85 to 100 %, %", "median width / need", "median s", "max s", "smallest error")
     return Grid("intervals, times, and number of splits with the smallest error", heads, rows)
 

@@ -109,10 +109,10 @@ def make_plan(options: Options, service: Service) -> Plan:
 
 def _cells(recording: Recording, split: str) -> Iterator[Cell]:
     for method in (PRODUCT, *ALONE):
-        yield Cell(recording=recording.name, split=split, told="nothing", method=method)
+        yield Cell(recording=recording.name, split=split, knowledge="nothing", method=method)
     if recording.robot is not None:
         for method in (PRODUCT, *WITH_BODY):
-            yield Cell(recording=recording.name, split=split, told="URDF", method=method)
+            yield Cell(recording=recording.name, split=split, knowledge="URDF", method=method)
 
 
 def compute_cell(cell: Cell, recording: Recording, split: Split, service: Service) -> Result:
@@ -120,10 +120,10 @@ def compute_cell(cell: Cell, recording: Recording, split: Split, service: Servic
     states = replace(split.test, tau=np.full_like(split.test.tau, np.nan))
     if cell.method == PRODUCT:
         bed, types = service(), recording.joint_types(split.train.n_joints)
-        robot = recording.robot if cell.told == "URDF" else None
-        trained = bed.train(f"{cell.recording}-{cell.split}-{cell.told}".lower(), split.train, types, robot)
+        robot = recording.robot if cell.knowledge == "URDF" else None
+        trained = bed.train(f"{cell.recording}-{cell.split}-{cell.knowledge}".lower(), split.train, types, robot)
         return evaluate_forecast(cell, split, bed.predict(trained, states), trained.seconds, trained.estimator)
-    known = cell.told == "URDF"
+    known = cell.knowledge == "URDF"
     predict = partial(WITH_BODY[cell.method], recording.body(split.train)) if known else ALONE[cell.method]
     began = time.monotonic()
     forecast = predict(split.train, states)

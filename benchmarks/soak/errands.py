@@ -86,20 +86,20 @@ class Desk:
 Errand = Callable[[Desk, int], Any]
 
 
-def watch_over(desk: Desk, turn: int) -> None:
+def scrape_health(desk: Desk, turn: int) -> None:
     """Send the requests of a monitoring system."""
     for path in ("/metrics", "/health", "/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"):
         desk.ask("GET", path)
 
 
-def look_on(desk: Desk, turn: int) -> None:
+def poll_dashboard(desk: Desk, turn: int) -> None:
     """Send the requests of an open dashboard."""
     desk.ask("GET", "/v1/overview")
     for path in ("learning", "quality", "observations?limit=10", "alarms?limit=5", "payload"):
         desk.ask("GET", f"/v1/models/{ARM}/{path}")
 
 
-def look_around(desk: Desk, turn: int) -> None:
+def read_resources(desk: Desk, turn: int) -> None:
     """Read every resource."""
     paths = ["models", "audit?limit=20", "jobs", "datasets", "robots", "robots/profiles", f"robots/profiles/{PROFILE}"]
     for path in [*paths, f"models/{ARM}/aliases"]:
@@ -122,12 +122,12 @@ def look_around(desk: Desk, turn: int) -> None:
         desk.ask("GET", path, 200, 307)
 
 
-def follow(desk: Desk, turn: int) -> None:
+def read_live_events(desk: Desk, turn: int) -> None:
     """Read some live events of the arm."""
     desk.events(f"/v1/models/{ARM}/live", 3)
 
 
-def correct(desk: Desk, turn: int) -> None:
+def correct_learning(desk: Desk, turn: int) -> None:
     """Replay rejected rows, undo a batch, declare and remove a payload, decide about a change."""
     touched = turn * CONTACT_S // BATCH_S
     path = f"/v1/models/{ARM}/observations/{ARM}"
@@ -138,7 +138,7 @@ def correct(desk: Desk, turn: int) -> None:
     desk.ask("POST", f"/v1/models/{ARM}/learning/change", 200, 409, json={"decision": "ignore"})
 
 
-def move(desk: Desk, turn: int) -> None:
+def move_alias(desk: Desk, turn: int) -> None:
     """Move an alias between versions, roll it back and delete it."""
     versions = [each["version"] for each in desk.ask("GET", f"/v1/models/{ARM}")["versions"]]
     path = f"/v1/models/{ARM}/aliases/{ALIAS}"
@@ -148,7 +148,7 @@ def move(desk: Desk, turn: int) -> None:
     desk.ask("DELETE", path, 204)
 
 
-def judge(desk: Desk, turn: int) -> None:
+def evaluate(desk: Desk, turn: int) -> None:
     """Evaluate and compare versions on a recording."""
     if not desk.datasets:
         return
@@ -161,14 +161,14 @@ def judge(desk: Desk, turn: int) -> None:
         desk.ask("POST", f"/v1/models/{ARM}/compare", 200, 404, json={"dataset": dataset, "versions": chosen})
 
 
-def tidy(desk: Desk, turn: int) -> None:
+def delete_versions(desk: Desk, turn: int) -> None:
     """Delete old versions."""
     for model in (ARM, LOOP):
         for each in _versions(desk, model)[:-MAX_VERSIONS]:  # oldest first
             desk.ask("DELETE", f"/v1/models/{model}/versions/{each['version']}", 204, 404, 409)
 
 
-def record(desk: Desk, turn: int) -> None:
+def upload_recordings(desk: Desk, turn: int) -> None:
     """Upload recordings as one file and as several, read them, and delete older ones."""
     samples = desk.recording(turn)
     for content, kind in ((npz(samples), "application/x-npz"), (joined(samples), "application/zip")):
@@ -181,7 +181,7 @@ def record(desk: Desk, turn: int) -> None:
         desk.ask("DELETE", f"/v1/datasets/{desk.datasets.pop(0)}", 204)
 
 
-def archive(desk: Desk, turn: int) -> None:
+def exchange_archives(desk: Desk, turn: int) -> None:
     """Export a version, import it as another model and delete that; export C and URDF; upload and delete a robot."""
     content = desk.ask("GET", f"/v1/models/{ARM}/export")
     kind = {"content-type": "application/x-tar"}
@@ -208,7 +208,7 @@ def set_learning(desk: Desk, turn: int) -> None:
 def train(desk: Desk, turn: int) -> None:
     """Train from recordings, cancel and retry a job, then retrain from observations."""
     if not desk.datasets:
-        record(desk, turn)
+        upload_recordings(desk, turn)
     request = {
         "model": ARM,
         "datasets": desk.datasets[-3::2],  # of each recording one of the two files
@@ -224,16 +224,16 @@ def train(desk: Desk, turn: int) -> None:
     _done(desk, desk.ask("POST", f"/v1/jobs/{job}/retry", 202)["id"])
     row = _ended(desk, desk.ask("POST", f"/v1/models/{ARM}/refresh", 202, json={})["id"])
     if row["state"] == "failed" and row["error"]["code"] == "observations_taken_back":
-        return  # by `correct`, which runs at the same time
+        return  # by `correct_learning`, which runs at the same time
     _succeeded(row)
 
 
-def renew(desk: Desk, turn: int) -> None:
+def retrain(desk: Desk, turn: int) -> None:
     """Retrain the model of the loop if possible, from the first hour on."""
     desk.ask("POST", f"/v1/models/{LOOP}/refresh", 202, 409, json={})
 
 
-def keep(desk: Desk, turn: int) -> None:
+def back_up(desk: Desk, turn: int) -> None:
     """Make a backup; create a key with a rate limit, exceed the limit, and revoke the key."""
     file = desk.folder / f"backup-{turn}"
     desk.command("backup", str(file))
@@ -246,12 +246,12 @@ def keep(desk: Desk, turn: int) -> None:
 
 
 ERRANDS: dict[int, tuple[Errand, ...]] = {
-    10: (look_on,),
-    15: (watch_over,),
-    60: (look_around,),
-    300: (follow, correct, move, judge, tidy),
-    900: (record, archive, set_learning, renew),
-    3600: (keep,),
+    10: (poll_dashboard,),
+    15: (scrape_health,),
+    60: (read_resources,),
+    300: (read_live_events, correct_learning, move_alias, evaluate, delete_versions),
+    900: (upload_recordings, exchange_archives, set_learning, retrain),
+    3600: (back_up,),
 }
 """Errands by their period in arm seconds."""
 SLOW: dict[int, tuple[Errand, ...]] = {3600: (train,)}

@@ -128,7 +128,7 @@ class ValueRange(Entry):
     def __post_init__(self) -> None:
         for joint, (low, high) in enumerate(zip(self.min, self.max, strict=False)):
             if low > high:
-                raise ValueError(f"min[{joint}] is {low:g}, expected at most the max, {high:g}")
+                raise ValueError(f"min[{joint}] is {low:g}, expected at most max[{joint}], which is {high:g}")
 
 
 class TrainingRange(Entry):

@@ -63,5 +63,5 @@ class Recipe:
         """Return the recipe with these settings; raise ValueError for an unknown name."""
         known = [each.name for each in fields(Recipe)]
         if unknown := sorted(set(choices) - set(known)):
-            raise ValueError(f"recipe has {unknown[0]!r}, expected only {', '.join(known)}")
+            raise ValueError(f"unknown setting {unknown[0]!r} of the recipe. Settings: {', '.join(known)}")
         return Recipe(**choices)

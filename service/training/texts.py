@@ -78,7 +78,7 @@ def describe_refresh(version: int, reason: str, better: bool, promoted: bool) ->
     if promoted:
         return f"is now serving: {reason}"
     if better:
-        return f"waits for approval: {reason}; roll back to version {version} to let it serve"
+        return f"is a candidate: {reason}; roll back to version {version} to let it serve"
     return f"is dismissed: {reason}"
 
 

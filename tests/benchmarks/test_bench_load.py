@@ -211,7 +211,7 @@ def test_short_day_has_no_errors():
     found = hours.run(hours.Options(0.1, rate=20), Console(quiet=True))
     assert found.errors == {}
     assert found.done["batch of 40 rows"] == 180
-    assert {"train", "archive", "keep", "record"} <= found.done.keys()
+    assert {"train", "exchange archives", "back up", "upload recordings"} <= found.done.keys()
     assert found.looks[-1].learner > 0
 
 

@@ -119,13 +119,15 @@ def test_the_time_between_episodes_does_not_count():
     np.testing.assert_allclose(elapsed(apart), np.arange(1200) / 100)
 
 
-def toy(recording="toy", split="other", told="nothing", method="mean", error=0.5, **figures):
+def toy(recording="toy", split="other", knowledge="nothing", method="mean", error=0.5, **figures):
     """Return an invented result."""
     usual = {
         **{"train_s": 20.0, "train_rows": 10, "test_rows": 10, "seconds": 1.0},
         **{"nmse": [error, error], "nmse_mean": [1.0, 1.0], "coverage": [0.95, 0.95], "width": [1.0, 1.0]},
     }
-    return Result(cell=Cell(recording=recording, split=split, told=told, method=method), **{**usual, **figures})
+    return Result(
+        cell=Cell(recording=recording, split=split, knowledge=knowledge, method=method), **{**usual, **figures}
+    )
 
 
 def test_figures_compare_errors_and_widths_with_measurements():
@@ -192,9 +194,9 @@ def test_targets_compare_the_product_with_the_best_other_method_of_each_split():
     found = targets(
         [
             toy("a", method=PRODUCT, error=0.3),
-            toy("a", told="URDF", method=PRODUCT, error=0.12),
+            toy("a", knowledge="URDF", method=PRODUCT, error=0.12),
             toy("a", method="RBF ridge", error=0.2),
-            toy("a", told="URDF", method="least squares", error=0.1),
+            toy("a", knowledge="URDF", method="least squares", error=0.1),
             toy("b", method=PRODUCT, nmse=[0.7, 0.1], nmse_mean=[0.5, 1.5], train_s=5.0, coverage=[0.5, 1.0]),
             toy("b", method="mean", error=0.1, train_s=5.0),
         ]

@@ -205,7 +205,11 @@ MANIFEST_ATTACKS = [
     (("compact", "data_samples"), "many", "compact.data_samples"),
     (("calibration", "function_std_factor"), 0.5, "function_std_factor"),
     (("training_range", "q", "min"), [0.0], "training_range.q.min"),
-    (("training_range", "q", "min"), [9e9, 0.0], "training_range.q: min[0] is 9e+09, expected at most the max"),
+    (
+        ("training_range", "q", "min"),
+        [9e9, 0.0],
+        "training_range.q: min[0] is 9e+09, expected at most max[0]",
+    ),
     (("training_range", "dq"), {}, "training_range.dq"),
     (("lineage",), [], "lineage"),
     (("lineage", "datasets"), [{"name": "no id"}], "datasets.0.id"),
