@@ -54,8 +54,7 @@ from service.storage.files.store import start_sweeping
 from service.storage.storage import Storage, lock_home
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import Probe, Readiness, StopState
-from service.training.metrics import JobMetrics
-from service.training.metrics import look as look_jobs
+from service.training.metrics import JobMetrics, check_queue
 from service.training.queue import JobQueue, queue_of
 
 logger = logging.getLogger(__name__)
@@ -205,9 +204,9 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -
     state, loaded, settings = app.state, learners.loaded, storage.settings
     probes: dict[str, Probe] = {
         **storage.probes(),
-        "models": loaded.look,
+        "models": loaded.check,
         "learner": learners.check_process,
-        "training": lambda lasting: look_jobs(jobs, lasting),
+        "training": lambda lasting: check_queue(jobs, lasting),
     }
     state.storage, state.loaded, state.jobs, state.learners = storage, loaded, jobs, learners
     state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))

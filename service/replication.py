@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 FIRST_PAUSE_S = 0.1
 """First pause before the listener reconnects, s; doubled each time."""
-FULL_LOOK_S = 5.0
+FULL_CHECK_S = 5.0
 """Seconds between two comparisons of everything in memory with the database, in case a notice was lost."""
 
 
@@ -67,7 +67,7 @@ class Replication:
             self._changed.notify_all()
 
     def _run(self) -> None:
-        due = time.monotonic() + FULL_LOOK_S
+        due = time.monotonic() + FULL_CHECK_S
         while True:
             with self._changed:
                 self._changed.wait_for(
@@ -86,8 +86,8 @@ class Replication:
                     self._wake(models)  # roles may have changed
                 self._learners.follow(grown & self._known())
                 if everything or time.monotonic() >= due:
-                    self._look_around()
-                    due = time.monotonic() + FULL_LOOK_S
+                    self._check_all_models()
+                    due = time.monotonic() + FULL_CHECK_S
             except Exception as error:  # the database may be unreachable: retry, nothing is lost
                 logger.warning("what other services have changed is not known now: %s", error)
                 with self._changed:
@@ -95,7 +95,7 @@ class Replication:
                     self._everything |= everything
                     self._changed.wait_for(lambda: self._ending, 1.0)
 
-    def _look_around(self) -> None:
+    def _check_all_models(self) -> None:
         """Compare all models in memory with the database, without a notice."""
         update_models(self._learners, self._known())
         behind = find_lagging_models(self._learners)
@@ -108,7 +108,7 @@ class Replication:
             self._learners.process.wake(model)
 
     def _known(self) -> set[str]:
-        return {model for model, _ in self._learners.loaded.held()}
+        return {model for model, _ in self._learners.loaded.versions_in_use()}
 
 
 class Listener:
@@ -157,7 +157,7 @@ def update_models(learners: Learners, models: Collection[str] | None) -> None:
 
     Blocking, as versions are loaded before they answer: use it in a thread.
     """
-    known = {model for model, _ in learners.loaded.held()} | learners.monitors().keys()
+    known = {model for model, _ in learners.loaded.versions_in_use()} | learners.monitors().keys()
     here = known if models is None else known & set(models)
     learners.loaded.announce(here)
     _point(learners, models)
@@ -166,7 +166,7 @@ def update_models(learners: Learners, models: Collection[str] | None) -> None:
 
 def find_lagging_models(learners: Learners) -> dict[str, int]:
     """Return the models with a revision here that is behind their log, with the number of the log's newest event."""
-    held = learners.loaded.held()
+    held = learners.loaded.versions_in_use()
     newest = select(func.max(EventRow.number)).where(EventRow.model == LearnerRow.model).scalar_subquery()
     query = select(LearnerRow.model, LearnerRow.version, LearnerRow.start, newest).where(
         LearnerRow.role == "serving", LearnerRow.model.in_({model for model, _ in held})
@@ -199,7 +199,7 @@ def _forget(learners: Learners, models: Collection[str]) -> None:
     """Remove deleted versions from memory."""
     loaded = learners.loaded
     with loaded.moving:
-        held = {key for key in loaded.held() if key[0] in models}
+        held = {key for key in loaded.versions_in_use() if key[0] in models}
         with learners.database.session() as session:
             rows = session.execute(select(VersionRow.model, VersionRow.version).where(VersionRow.model.in_(models)))
             kept = {(model, version) for model, version in rows}

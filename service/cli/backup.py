@@ -29,7 +29,7 @@ def backup_(
     The backup contains everything that was acknowledged before the command started. It contains secrets: protect it
     like the home.
     """
-    _say("copied", backup(_own("back up").home, file), as_json)
+    _print_backup("copied", backup(_own("back up").home, file), as_json)
 
 
 @restore_app.command("restore")
@@ -41,7 +41,7 @@ def restore_(
 
     API keys that were revoked after the backup are valid again.
     """
-    _say("restored", restore(_own("restore").home, file), as_json)
+    _print_backup("restored", restore(_own("restore").home, file), as_json)
 
 
 def _own(action: str) -> Settings:
@@ -56,7 +56,7 @@ def _own(action: str) -> Settings:
     return settings
 
 
-def _say(done: str, made: Backup, as_json: bool) -> None:
+def _print_backup(done: str, made: Backup, as_json: bool) -> None:
     print_result(
         made,
         as_json,

@@ -176,13 +176,13 @@ def _holdout_of(loaded: LoadedModels, served: ServedModel) -> dict[str, Any]:
 def _repeats(loaded: LoadedModels, served: ServedModel, used: Samples, in_training: bool) -> dict[str, Any]:
     """Return how much of the samples repeats the training motion, unless the version was trained on them."""
     if in_training:
-        return repeating.look([], used, served.model.joint_types)
+        return repeating.find_repetition([], used, served.model.joint_types)
     version = registry.find(loaded.database, served.name, served.version)
     try:
         training = repeating.read_training_parts(loaded.database, loaded.files, version.manifest["lineage"])
-        return repeating.look(training, used, served.model.joint_types)
+        return repeating.find_repetition(training, used, served.model.joint_types)
     except (CannotHoldOutError, DamagedDataError) as error:  # the figures are valid without the training data
-        return {**repeating.look([], used, ()), "warnings": [texts.describe_unknown_repetition(error)]}
+        return {**repeating.find_repetition([], used, ()), "warnings": [texts.describe_unknown_repetition(error)]}
 
 
 Rows = NDArray[np.int64]

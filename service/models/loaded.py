@@ -225,7 +225,7 @@ class LoadedModels:
             logger.info("version %d of model %s was deleted before it served", serving.version, model)
         return False
 
-    def held(self) -> dict[Key, int | None]:
+    def versions_in_use(self) -> dict[Key, int | None]:
         """Return the versions in use here and their revisions: in memory, used by streams, or serving.
 
         The revision is None for a serving version that was dropped from memory.
@@ -239,7 +239,7 @@ class LoadedModels:
         """Return the versions in memory; the call does not count as use."""
         return self._snapshot.served.keys()
 
-    def look(self, lasting: object = None) -> tuple[PartState, str]:
+    def check(self, lasting: object = None) -> tuple[PartState, str]:
         """Return whether the serving versions can be read, for readiness."""
         lost, models = registry.count_unreadable(self.database, self.files, self.versions(), self.unreadable())
         if not lost:

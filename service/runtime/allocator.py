@@ -47,18 +47,18 @@ def limit_free_memory(environment: Mapping[str, str] = os.environ) -> bool:
         (Mallopt.TRIM_THRESHOLD, BLOCK_BYTES),
     )
     taken = [library.mallopt(parameter, value) for parameter, value in settings]
-    threading.Thread(target=_give_back_often, name="give-back", daemon=True).start()
+    threading.Thread(target=_release_memory_often, name="give-back", daemon=True).start()
     return all(taken)
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Return all free memory of this process to the system; do nothing without glibc."""
     library = ctypes.CDLL(None)
     if hasattr(library, "malloc_trim"):
         library.malloc_trim(0)
 
 
-def _give_back_often() -> None:
+def _release_memory_often() -> None:
     while True:
         time.sleep(60.0)  # `malloc_trim` locks a heap for a millisecond
-        give_back()
+        release_memory()

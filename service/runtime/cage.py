@@ -25,7 +25,7 @@ from lipcore.extras import MissingExtraError
 from service.foundation.errors import NotReadyError, ServiceError, TooLargeError, invalid_data, problem, readable
 from service.foundation.settings import Settings
 from service.runtime.confinement import MAX_OPEN_FILES
-from service.runtime.progress import LOOK_S, Progress
+from service.runtime.progress import CHECK_S, Progress
 from service.runtime.reader_messages import (
     ERRORS,
     MAX_OUTPUT_BYTES,
@@ -122,7 +122,7 @@ def _ask(call: Call) -> Outcome:
         try:
             connection, process = _spawner.connect()
             with connection:
-                _hand_over(call, connection, process)
+                _start_call(call, connection, process)
                 connection.settimeout(call.wall_s + IMPORT_S)
                 send(connection, data)
                 return _decoder(Outcome).decode(receive(connection))
@@ -132,13 +132,13 @@ def _ask(call: Call) -> Outcome:
     raise NotReadyError(f"uploads cannot be read at present: no reader process could be started ({failed!r})")
 
 
-def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
+def _start_call(call: Call, connection: socket.socket, process: Any) -> None:
     """Send the name of a call's function and wait until a process accepts the call.
 
     Raise TimeoutError if the waiting process hangs; it is killed first.
     """
     progress = Progress(lambda: [process.pid], call.wall_s, IMPORT_S)
-    connection.settimeout(LOOK_S)
+    connection.settimeout(CHECK_S)
     send(connection, call.function.encode())
     while True:
         try:
@@ -146,7 +146,7 @@ def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
                 return
             raise EOFError
         except TimeoutError:
-            if (reason := progress.look()) is not None:
+            if (reason := progress.check()) is not None:
                 logger.error("the process that reads uploads hangs and is killed: %s", reason)
                 _spawner.end(process)
                 raise

@@ -14,7 +14,7 @@ from service.runtime.executors import ClusterUnavailableError, connect
 
 logger = logging.getLogger(__name__)
 
-LOOK_S = 2.0
+CHECK_S = 2.0
 """Seconds between two checks of the scheduler."""
 JOB, GPU = "JOB", "GPU"
 """Tags of workers that run jobs, and of those that have a GPU."""
@@ -78,16 +78,16 @@ class Cluster:
     def _run(self) -> None:
         while not self._closing.is_set():
             try:
-                self._look()
+                self._refresh()
                 self.problem = None
             except Exception as error:
                 reason = str(error) or type(error).__name__
                 if self.problem != reason:
                     logger.warning("the cluster cannot be used: %s", reason)
                 self.problem, self.jobs, self.gpus = reason, 0, 0
-            self._closing.wait(LOOK_S)
+            self._closing.wait(CHECK_S)
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         if self._client is not None and self._client.status not in ("running", "connecting"):
             self._leave()
         if self._client is None:
@@ -104,7 +104,7 @@ class Cluster:
         """Raise an error if nothing listens at the address; without this check, a client retries and logs for long."""
         parts = urlsplit(self.address)
         try:
-            socket.create_connection((parts.hostname or "", parts.port or 8786), LOOK_S).close()
+            socket.create_connection((parts.hostname or "", parts.port or 8786), CHECK_S).close()
         except OSError as error:
             raise ClusterUnavailableError(
                 f"the scheduler {self.address} of the cluster cannot be reached: {error.strerror or error}"

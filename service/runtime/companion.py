@@ -19,7 +19,7 @@ from typing import Any
 
 from service.foundation.settings import Settings
 from service.runtime.process import ProcessOptions, call, start_process
-from service.runtime.progress import LOOK_S, Progress
+from service.runtime.progress import CHECK_S, Progress
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ class Companion:
         """Return whether there should be a process: it has received work, and the service is not closing."""
         return bool(self._threads) and not self._closing
 
-    def give(self, about: Hashable, *items: Any, most: int | None = None) -> int:
+    def queue_work(self, about: Hashable, *items: Any, most: int | None = None) -> int:
         """Queue work for the process without waiting; return the number of dropped items.
 
         most: max items that wait; the oldest are dropped.
@@ -177,11 +177,11 @@ class Companion:
         progress = self._progress = Progress(lambda: pids, COMPANION.quiet_s, COMPANION.step_s)
         while True:
             try:
-                message = connection.recv() if connection.poll(min(LOOK_S, COMPANION.quiet_s / 4)) else None
+                message = connection.recv() if connection.poll(min(CHECK_S, COMPANION.quiet_s / 4)) else None
             except (EOFError, OSError):
                 return
             if message is None:
-                if (reason := progress.look()) is not None and process.is_alive():
+                if (reason := progress.check()) is not None and process.is_alive():
                     logger.error("the %s process hangs and is killed: %s", self.name, reason)
                     process.kill()
                     return

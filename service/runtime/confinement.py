@@ -75,7 +75,7 @@ def confine(bounds: Bounds, read: Iterable[Path], write: Iterable[Path]) -> None
     has = protections()
     _limit(bounds, has["memory"])
     if has["landlock"]:
-        _keep_files([*read, *own_files()], write)
+        _restrict_files([*read, *own_files()], write)
 
 
 def _limit(bounds: Bounds, memory: bool) -> None:
@@ -156,7 +156,7 @@ class _Rule(ctypes.Structure):
     _fields_ = (("allowed", ctypes.c_uint64), ("parent", ctypes.c_int32))
 
 
-def _keep_files(read: Iterable[Path], write: Iterable[Path]) -> None:
+def _restrict_files(read: Iterable[Path], write: Iterable[Path]) -> None:
     """Allow some files and folders; forbid all others, TCP and signals to other processes."""
     version = _landlock_version()
     rights_since = {1: 13, 2: 14, 3: 15, 5: 16}  # number of rights by the version that added them

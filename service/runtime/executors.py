@@ -27,7 +27,7 @@ from lipcore.extras import import_extra
 from service.foundation.settings import Settings
 from service.runtime import remote
 from service.runtime.process import ProcessOptions, start_process
-from service.runtime.progress import HEARTBEAT_S, LOOK_S, Progress
+from service.runtime.progress import CHECK_S, HEARTBEAT_S, Progress
 from service.telemetry import logs
 
 P = ParamSpec("P")
@@ -111,12 +111,12 @@ class Processes(Executor):
         future.add_done_callback(lambda _: self._progress.step())
         return future
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Kill all processes if none makes progress for HEARTBEAT_S while work waits. Call it often."""
-        if time.monotonic() - self._looked < LOOK_S / 4:
+        if time.monotonic() - self._looked < CHECK_S / 4:
             return
         self._looked = time.monotonic()
-        if (reason := self._progress.look()) is not None:
+        if (reason := self._progress.check()) is not None:
             logger.error("processes that compute statistics hang and are killed: %s", reason)
             self._progress.step()
             for process in self._processes():
@@ -274,7 +274,7 @@ def sum_shards(
                 tries[number] += 1
                 running[executor.submit(work, shards[number])] = number
             if isinstance(executor, Processes):
-                executor.look()
+                executor.check()
             for future in wait(running, 0 if more else POLL_S, FIRST_COMPLETED).done:
                 number, error = running.pop(future), _error(future)
                 if error is None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 HEARTBEAT_S = 60.0
 """Seconds without progress after which a computing process is killed: such a step takes seconds."""
-LOOK_S = 1.0
+CHECK_S = 1.0
 """Seconds between two checks. A longer gap counts as at most twice this time: the checking process may have stopped."""
 TICK_S = 0.01
 """CPU time that counts as progress, s: one tick of the system. An idle wait takes far less."""
@@ -56,10 +56,10 @@ class Progress:
         """Record a step."""
         self.silent_s = self._stepless_s = 0.0
 
-    def look(self) -> str | None:
-        """Return why the processes are considered hung, None if they make progress. Call it every LOOK_S."""
+    def check(self) -> str | None:
+        """Return why the processes are considered hung, None if they make progress. Call it every CHECK_S."""
         now = self._clock()
-        passed, self._looked = min(now - self._looked, 2 * LOOK_S), now
+        passed, self._looked = min(now - self._looked, 2 * CHECK_S), now
         spent = {pid: each for pid in self._pids() if (each := self._spent(pid)) is not None}
         self._stepless_s += passed
         if not spent or any(each - self._known.get(pid, -TICK_S) >= TICK_S for pid, each in spent.items()):

@@ -115,10 +115,10 @@ def _watch(calls: socket.socket) -> None:
             data = receive(connection)
             with suppress(BrokenPipeError), os.fdopen(given_end, "wb") as file:
                 file.write(data)
-            _see_to(pid, answer, output, connection, msgspec.msgpack.decode(data, type=Call).wall_s)
+            _supervise(pid, answer, output, connection, msgspec.msgpack.decode(data, type=Call).wall_s)
 
 
-def _see_to(pid: int, answer: int, output: int, connection: socket.socket, wall_s: float) -> None:
+def _supervise(pid: int, answer: int, output: int, connection: socket.socket, wall_s: float) -> None:
     """Send the outcome of a process once it has answered or ended; kill it at its time limit."""
     until = time.monotonic() + wall_s
     content, written, in_time = _collected(answer, output, connection, until)

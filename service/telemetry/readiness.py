@@ -70,7 +70,7 @@ class Readiness:
         """Return the state of all parts, at most MAX_REPORT_AGE_S old; never raise."""
         with self._lock:
             if self._clock() >= self._until:
-                self._report = tuple(self._check(name, look) for name, look in self.probes.items())
+                self._report = tuple(self._check(name, probe) for name, probe in self.probes.items())
                 self._until = self._clock() + MAX_REPORT_AGE_S
             if self._stopping.begun:
                 return Check("stopping", "failed", "the service is stopping"), *self._report
@@ -81,9 +81,9 @@ class Readiness:
         with self._lock:
             self._until = -float("inf")
 
-    def _check(self, name: str, look: Probe) -> Check:
+    def _check(self, name: str, probe: Probe) -> Check:
         try:
-            return Check(name, *look(partial(self._lasting, name)))
+            return Check(name, *probe(partial(self._lasting, name)))
         except Exception as error:  # a part that raises any error does not work
             reason = getattr(error, "strerror", None) or error  # without paths: this report is public
             return Check(name, "failed", f"{type(error).__name__}: {reason}")

@@ -44,7 +44,7 @@ class ClusterQueue(JobQueue):
 
     def recover(self) -> list[str]:
         """Resume watching the jobs of an earlier run; none has to be queued again."""
-        self._inbox.put(self._look_around)
+        self._inbox.put(self._reconcile_soon)
         return []
 
     def close(self) -> None:
@@ -52,17 +52,17 @@ class ClusterQueue(JobQueue):
         super().close()
         self._away.close()
 
-    def _hand_back(self) -> None:
+    def _release_jobs(self) -> None:
         self.replicas.release_jobs()
 
-    def _look_around(self) -> None:
+    def _reconcile_soon(self) -> None:
         self._reconciled = -float("inf")
 
-    def _see_to(self, row: JobRow, ours: bool) -> None:
+    def _recover_job(self, row: JobRow, ours: bool) -> None:
         """Watch a job that runs on a worker."""
         self._watched_jobs.append(WatchedJob(row.id, None, None, time.monotonic(), away=True))
 
-    def _hand_out(self) -> None:
+    def _start_waiting(self) -> None:
         clock = time.monotonic()
         known = {watched.job for watched in self._watched_jobs} | self._settling
         for job in [job for job, at in self._waiting.items() if at <= clock and job not in known]:
@@ -95,8 +95,8 @@ class ClusterQueue(JobQueue):
             row.owner = self.replicas.id
         return gpu
 
-    def _look(self) -> None:
-        super()._look()
+    def _check_jobs(self) -> None:
+        super()._check_jobs()
         for watched in list(self._watched_jobs):
             if watched.future is None or self._away.knows(watched.future):
                 continue
@@ -108,7 +108,7 @@ class ClusterQueue(JobQueue):
             if error is None or is_worker_lost(error):
                 self._wait(watched.job, time.monotonic() + RETRY_S)
             else:
-                self._pass_on(JobEnd(watched.job, "refused", f"a worker could not start the job: {error}"))
+                self._settle_later(JobEnd(watched.job, "refused", f"a worker could not start the job: {error}"))
 
     def _end(self, watched: WatchedJob) -> None:
         if watched.future is not None and watched.ran is None:  # a worker that has begun reads its row

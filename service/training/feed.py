@@ -17,7 +17,7 @@ from service.storage.database import Database, JobRow
 
 logger = logging.getLogger(__name__)
 
-LOOK_S = 0.4
+CHECK_S = 0.4
 """Interval between two reads of the followed jobs, s."""
 MAX_FOLLOWERS = 100
 """Maximum event streams of jobs at a time; further requests are answered 429."""
@@ -61,7 +61,7 @@ class JobEventStream(OpenCounter):
     async def _read(self, closing: asyncio.Event) -> None:
         while self._followers and not closing.is_set():
             try:
-                rows = await to_thread.run_sync(self._look, list(self._followers))
+                rows = await to_thread.run_sync(self._read_rows, list(self._followers))
             except Exception:  # a database error: the next read may succeed
                 logger.exception("could not read the followed jobs")
                 rows = []
@@ -71,7 +71,7 @@ class JobEventStream(OpenCounter):
                     self._rows[row.id] = row
                     self._wake(row.id)
             with suppress(TimeoutError):
-                await asyncio.wait_for(closing.wait(), LOOK_S)
+                await asyncio.wait_for(closing.wait(), CHECK_S)
         for job in list(self._followers):
             self._wake(job)
 
@@ -79,7 +79,7 @@ class JobEventStream(OpenCounter):
         for changed in self._followers[job]:
             changed.set()
 
-    def _look(self, jobs: list[str]) -> list[JobRow]:
+    def _read_rows(self, jobs: list[str]) -> list[JobRow]:
         with self.database.session() as session:
             return list(session.scalars(select(JobRow).where(JobRow.id.in_(jobs))))
 

@@ -131,7 +131,7 @@ class Host:
         while not wait([future], WATCH_S).done:
             if _stopping.is_set():
                 self.slot.kill()
-                self._patiently(lambda: self._hand_back(watched.job, attempt))
+                self._patiently(lambda: self._requeue(watched.job, attempt))
                 return False
             try:
                 row = self._row(watched.job)
@@ -143,7 +143,7 @@ class Host:
                 self.slot.kill()  # another attempt has the job
                 return True
             if row.attempts == attempt:
-                watched.see(JobStatus(row.state, row.heartbeat_at, row.cancel_requested), clock)
+                watched.update(JobStatus(row.state, row.heartbeat_at, row.cancel_requested), clock)
             if (end := watched.judge(self.settings, clock)) is not None:
                 self.slot.kill()
                 self._settle(JobEnd(watched.job, end.why, end.message, attempt))
@@ -174,12 +174,12 @@ class Host:
         with self.database.session() as session:
             return lifecycle.row_of(session, job)
 
-    def _hand_back(self, job: str, attempt: int) -> None:
+    def _requeue(self, job: str, attempt: int) -> None:
         with self.database.transaction() as session:
             row = lifecycle.row_of(session, job)
             if row is None or row.state != RUNNING or row.attempts != attempt:
                 return
-            lifecycle.hand_back(row, texts.WORKER_STOPPED)
+            lifecycle.requeue(row, texts.WORKER_STOPPED)
         lifecycle.remove_leftovers(self.database, self.files, job)
 
     def _settle(self, end: JobEnd) -> None:
@@ -241,7 +241,7 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     stopping = asyncio.create_task(stopped.wait())
     while not stopped.is_set():
-        joined = asyncio.create_task(_be_member(settings, scheduler, resources, name))
+        joined = asyncio.create_task(_run_worker(settings, scheduler, resources, name))
         await asyncio.wait({joined, stopping}, return_when=asyncio.FIRST_COMPLETED)
         if stopped.is_set():
             await asyncio.to_thread(stop, 10.0)  # the job waits for another worker
@@ -256,7 +256,7 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
             await asyncio.wait_for(stopped.wait(), 2.0)
 
 
-async def _be_member(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
+async def _run_worker(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
     """Stay in the cluster until the scheduler is gone or this task is cancelled."""
     logging.getLogger("distributed").setLevel(logging.WARNING)  # its import set another level
     options = {"distributed.worker.profile.enabled": False, "distributed.worker.daemon": False}

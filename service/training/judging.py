@@ -24,7 +24,7 @@ def judged_figures(model: TorqueModel, data: TrainingData) -> dict[str, Any]:
     table, most = data.held_out, MAX_EVALUATION_SAMPLES
     assert table is not None  # something was held out
     samples = table.thinned(most)
-    repeats = repeating.look(data.table.parts, samples, model.joint_types)
+    repeats = repeating.find_repetition(data.table.parts, samples, model.joint_types)
     judged = {"judged_rows": data.rows, "torque_noise": white(data.samples, data.stretches).tolist()}
     found = {**judged, **figures(model, samples, most, len(table)), **repeats}
     if data.every is None:
@@ -40,5 +40,5 @@ def _evaluation(model: TorqueModel, data: TrainingData, part: TablePart, most: i
     """Return the evaluation of the fit on the held-out rows of one data set."""
     _, samples = part.motion(most)
     found = evaluation(samples, answer_of(model, samples))
-    repeats = repeating.look(data.table.parts, samples, model.joint_types)
+    repeats = repeating.find_repetition(data.table.parts, samples, model.joint_types)
     return Evaluation(samples=len(part), **found, **repeats).model_dump(mode="json")

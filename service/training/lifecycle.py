@@ -45,7 +45,7 @@ def row_of(session: Session, job: str) -> JobRow | None:
     return row
 
 
-def hand_back(row: JobRow, why: str) -> None:
+def requeue(row: JobRow, why: str) -> None:
     """Let a job wait again after an orderly stop of its process; that start does not count as an attempt."""
     if row.cancel_requested:
         enter(row, CANCELLED, f"cancelled: {why}")
@@ -130,7 +130,7 @@ class WatchedJob:
     beat_at: float = 0.0
     """When that heartbeat was first seen."""
 
-    def see(self, status: JobStatus, clock: float) -> None:
+    def update(self, status: JobStatus, clock: float) -> None:
         """Record the state in the row."""
         if status.state == RUNNING and self.ran is None:
             self.ran = self.beat_at = clock

@@ -59,7 +59,7 @@ class JobMetrics(Collector):
         yield self.duration.spread(([outcome], durations[outcome]) for outcome in OUTCOMES)
 
 
-def look(queue: JobQueue, lasting: FaultAge) -> tuple[PartState, str]:
+def check_queue(queue: JobQueue, lasting: FaultAge) -> tuple[PartState, str]:
     """Return whether queued jobs are started, for readiness."""
     with queue.database.session() as session:
         counts = _counts(session)

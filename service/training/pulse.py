@@ -233,7 +233,7 @@ class Heartbeat:
             self._stop = row.cancel_requested
 
     def _gets_on(self) -> bool:
-        reason = self._progress.look()
+        reason = self._progress.check()
         if reason is not None and not self._hangs:
             logger.error("no more heartbeats are sent: %s", reason)
         self._hangs = reason is not None

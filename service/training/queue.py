@@ -103,16 +103,16 @@ class JobQueue:
             slot.close()
         self._clerk.join()
         try:
-            self._hand_back()
+            self._release_jobs()
         except Exception:  # the next start finds them, as after a kill
             logger.exception("could not queue the running jobs again")
         self.replicas.close()
 
-    def _hand_back(self) -> None:
+    def _release_jobs(self) -> None:
         with self.database.transaction() as session:
             for row in session.scalars(select(JobRow).where(JobRow.state == RUNNING)):
                 if self.replicas.is_mine(row.owner):
-                    lifecycle.hand_back(row, texts.SERVICE_STOPPED)
+                    lifecycle.requeue(row, texts.SERVICE_STOPPED)
 
     def _is_ready(self, row: JobRow) -> bool:
         if row.state == QUEUED and not row.cancel_requested:
@@ -129,7 +129,7 @@ class JobQueue:
                 pass
             except Exception:
                 logger.exception("error in the job queue, which continues")
-            for step in (self._look, self._reconcile, self._hand_out):
+            for step in (self._check_jobs, self._reconcile, self._start_waiting):
                 try:
                     step()
                 except Exception:  # a database error: the next check may succeed
@@ -143,7 +143,7 @@ class JobQueue:
             if watched.job == job:
                 watched.stop(time.monotonic())
 
-    def _hand_out(self) -> None:
+    def _start_waiting(self) -> None:
         busy = {watched.slot for watched in self._watched_jobs}
         running = {watched.job for watched in self._watched_jobs} | self._settling
         clock = time.monotonic()
@@ -159,14 +159,14 @@ class JobQueue:
             try:
                 future = slot.start(worker.run, self.settings, job)
             except Exception as error:  # no memory, too many processes
-                self._pass_on(JobEnd(job, "ended", texts.describe_start_failure(error)))
+                self._settle_later(JobEnd(job, "ended", texts.describe_start_failure(error)))
                 continue
             watched = WatchedJob(job, slot, future, clock)
             self._watched_jobs.append(watched)
             # called by a thread of the pool that may hold its lock, so it only puts a message
             future.add_done_callback(lambda _, watched=watched: self._inbox.put(partial(self._ended, watched)))  # type: ignore[misc]
 
-    def _look(self) -> None:
+    def _check_jobs(self) -> None:
         """Check the running jobs, and kill processes that must end."""
         clock = time.monotonic()
         if not self._watched_jobs or clock - self._watched < WATCH_S:
@@ -179,7 +179,7 @@ class JobQueue:
                 if end := watched.judge(self.settings, clock):
                     self._watched_jobs.remove(watched)
                     self._end(watched)
-                    self._pass_on(end)
+                    self._settle_later(end)
 
     def _end(self, watched: WatchedJob) -> None:
         watched.slot.kill()
@@ -195,7 +195,7 @@ class JobQueue:
             }
         for watched in self._watched_jobs:
             if watched.job in status:
-                watched.see(status[watched.job], clock)
+                watched.update(status[watched.job], clock)
             if watched.ran is not None:
                 self.problem = None
 
@@ -205,13 +205,13 @@ class JobQueue:
         self._watched_jobs.remove(watched)
         error = watched.future.exception()
         if error is None:
-            self._pass_on(JobEnd(watched.job, "returned", texts.RETURNED))
+            self._settle_later(JobEnd(watched.job, "returned", texts.RETURNED))
         elif isinstance(error, BrokenProcessPool):
-            self._pass_on(JobEnd(watched.job, "ended", f"the training process {watched.slot.ending()}"))
+            self._settle_later(JobEnd(watched.job, "ended", f"the training process {watched.slot.ending()}"))
         else:
-            self._pass_on(JobEnd(watched.job, "ended", texts.describe_process_failure(error)))
+            self._settle_later(JobEnd(watched.job, "ended", texts.describe_process_failure(error)))
 
-    def _pass_on(self, end: JobEnd) -> None:
+    def _settle_later(self, end: JobEnd) -> None:
         self._settling.add(end.job)
         self._desk.put(end)
 
@@ -235,17 +235,17 @@ class JobQueue:
             if row.state == QUEUED:
                 self.submit(row.id)
             else:
-                self._see_to(row, ours)
+                self._recover_job(row, ours)
 
-    def _see_to(self, row: JobRow, ours: bool) -> None:
+    def _recover_job(self, row: JobRow, ours: bool) -> None:
         """Settle a job that runs by its row but not in a process here.
 
         `ours` is False if it was just taken over.
         """
         if not ours:
-            self._pass_on(JobEnd(row.id, "ended", texts.SERVICE_GONE))
+            self._settle_later(JobEnd(row.id, "ended", texts.SERVICE_GONE))
         elif _age(row.heartbeat_at) > lifecycle.LIMITS.heartbeat_s:
-            self._pass_on(JobEnd(row.id, "ended", texts.NO_PROCESS))
+            self._settle_later(JobEnd(row.id, "ended", texts.NO_PROCESS))
 
     def _settled(self, job: str, outcome: JobOutcome) -> None:
         self._settling.discard(job)

@@ -35,7 +35,7 @@ def unrepeated(part: TablePart, joint_types: Sequence[str], asked: Holdout) -> l
     return [[border[first], border[last]] for first, last in spans]
 
 
-def look(training: Sequence[TablePart], part: Samples, joint_types: Sequence[str]) -> dict[str, Any]:
+def find_repetition(training: Sequence[TablePart], part: Samples, joint_types: Sequence[str]) -> dict[str, Any]:
     """Return how much of some samples repeats the training data, under the names of lineages and the API.
 
     Values are null if no training data are left.

@@ -23,7 +23,7 @@ from service.foundation.settings import Settings
 from service.models import registry
 from service.models.evaluation import MAX_EVALUATION_SAMPLES
 from service.models.lineage import MAX_METRIC_SAMPLES, figures, software
-from service.runtime.allocator import give_back
+from service.runtime.allocator import release_memory
 from service.runtime.executors import ClusterUnavailableError
 from service.storage import errors as storage_errors
 from service.storage.database import Database, JobRow, VersionRow, now
@@ -63,7 +63,7 @@ def run(settings: Settings, job: str) -> None:
     finally:
         database.close()
         job_id.reset(token)
-        give_back()  # return free memory, as the process waits for the next job
+        release_memory()  # return free memory, as the process waits for the next job
 
 
 @lru_cache(1)

@@ -132,7 +132,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
                     if pause is None:
                         begun, events = True, sending.Events()
                         async for line in response.aiter_lines():
-                            if (event := events.take(line)) is not None:
+                            if (event := events.add_line(line)) is not None:
                                 yield sending.result_of(call, event)
             except httpx.TransportError as error:
                 pause = attempts.after_error(error, begun)

@@ -290,7 +290,7 @@ class Exchange:
         header = REQUEST.pack(self._sequence, flags, n, deadline)
         return self._sequence, b"".join((header, *(part.tobytes() for part in parts)))
 
-    def take(self, data: str | bytes) -> None:
+    def receive(self, data: str | bytes) -> None:
         """Process a message of the service; raise StreamError if its frame layout is not supported."""
         if isinstance(data, bytes):
             answer = self._timed(read_answer(data))

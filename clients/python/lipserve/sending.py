@@ -139,7 +139,7 @@ class Events:
     def __init__(self) -> None:
         self._event, self._data = "", list[str]()
 
-    def take(self, line: str) -> Answer | None:
+    def add_line(self, line: str) -> Answer | None:
         """Add a line without its end; return the event if the line completes one."""
         if line.startswith("event:"):
             self._event = line.removeprefix("event:").strip()

@@ -175,7 +175,7 @@ class StreamClient(_Stream):
         with self._opening():
             made = _connect(host, port, self._unix, self._patience)
             self._socket = self._stack.enter_context(connect(address, sock=made, **self._options))
-        self._take(self._patience)
+        self._receive(self._patience)
 
     def __enter__(self) -> Self:
         return self
@@ -226,7 +226,7 @@ class StreamClient(_Stream):
         sequence = self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
             try:
-                self._take(max(0.0, end - monotonic()))
+                self._receive(max(0.0, end - monotonic()))
             except StreamError as error:
                 return self._late(sequence, deadline, error)
         return self._in_time(answer)
@@ -258,7 +258,7 @@ class StreamClient(_Stream):
     def receive(self) -> StreamAnswer:
         """Return the answer to the oldest open query; raise StreamError if the query was rejected."""
         while not self._exchange.answers:
-            self._take(self.timeout)
+            self._receive(self.timeout)
         return self._exchange.answer()
 
     def flush(self, timeout: float | None = None) -> StreamLearnt:
@@ -276,14 +276,14 @@ class StreamClient(_Stream):
         end = monotonic() + timeout
         while self._exchange.unsettled:
             try:
-                self._take(max(end - monotonic(), 0.0))
+                self._receive(max(end - monotonic(), 0.0))
             except StreamError as error:
                 if error.code != "timeout":
                     raise
                 raise unsettled(len(self._exchange.unsettled), timeout) from error
         return self._exchange.learnt
 
-    def _take(self, timeout: float) -> None:
+    def _receive(self, timeout: float) -> None:
         """Receive and process one message."""
         try:
             message = self._socket.recv(timeout)
@@ -292,7 +292,7 @@ class StreamClient(_Stream):
         except ConnectionClosed as error:
             raise closed(error) from error
         try:
-            self._exchange.take(message)
+            self._exchange.receive(message)
         except StreamError:  # unsupported frame layout
             self.close()
             raise
@@ -320,7 +320,7 @@ class AsyncStreamClient(_Stream):
             else:
                 self._connection = await awaited.unix_connect(str(self._unix), address, **self._options)
         try:
-            await self._take(self._patience)
+            await self._receive(self._patience)
         except BaseException:
             await self.close()
             raise
@@ -353,7 +353,7 @@ class AsyncStreamClient(_Stream):
         sequence = await self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
             try:
-                await self._take(max(0.0, end - monotonic()))
+                await self._receive(max(0.0, end - monotonic()))
             except StreamError as error:
                 return self._late(sequence, deadline, error)
         return self._in_time(answer)
@@ -385,7 +385,7 @@ class AsyncStreamClient(_Stream):
     async def receive(self) -> StreamAnswer:
         """Return the answer to the oldest open query; raise StreamError if the query was rejected."""
         while not self._exchange.answers:
-            await self._take(self.timeout)
+            await self._receive(self.timeout)
         return self._exchange.answer()
 
     async def flush(self, timeout: float | None = None) -> StreamLearnt:
@@ -394,12 +394,12 @@ class AsyncStreamClient(_Stream):
         try:
             async with asyncio.timeout(timeout):
                 while self._exchange.unsettled:
-                    await self._take(None)
+                    await self._receive(None)
         except TimeoutError as error:
             raise unsettled(len(self._exchange.unsettled), timeout) from error
         return self._exchange.learnt
 
-    async def _take(self, timeout: float | None) -> None:
+    async def _receive(self, timeout: float | None) -> None:
         """Receive and process one message."""
         try:
             async with asyncio.timeout(timeout):
@@ -409,7 +409,7 @@ class AsyncStreamClient(_Stream):
             raise unanswered(timeout) from error
         except ConnectionClosed as error:
             raise closed(error) from error
-        self._exchange.take(message)
+        self._exchange.receive(message)
 
     def _open(self) -> awaited.ClientConnection:
         if self._connection is None:

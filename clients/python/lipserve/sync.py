@@ -150,7 +150,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
                     if pause is None:
                         begun, events = True, sending.Events()
                         for line in response.iter_lines():
-                            if (event := events.take(line)) is not None:
+                            if (event := events.add_line(line)) is not None:
                                 yield sending.result_of(call, event)
             except httpx.TransportError as error:
                 pause = attempts.after_error(error, begun)

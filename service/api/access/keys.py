@@ -225,7 +225,7 @@ class Keyring:
     @asynccontextmanager
     async def watching(self, database: Database) -> AsyncIterator[None]:
         """Read the keys now and then regularly while the context is open."""
-        self._take(await to_thread.run_sync(list_keys, database, limiter=self._thread))
+        self._update_keys(await to_thread.run_sync(list_keys, database, limiter=self._thread))
         valid = sum(key.valid(time()) for key in self._keys.values())
         if valid:
             logger.info("API keys are required; %d valid", valid)
@@ -255,10 +255,10 @@ class Keyring:
             self._failing = True
         else:
             self._failing = False
-            self._take(rows)
+            self._update_keys(rows)
         self._end_lasting()
 
-    def _take(self, rows: list[ApiKeyRow]) -> None:
+    def _update_keys(self, rows: list[ApiKeyRow]) -> None:
         known = {key.id: key for key in self._keys.values()}
         fresh: dict[bytes, Key] = {}
         for row in rows:

@@ -83,7 +83,7 @@ class BodyLimit:
         self.seconds, self.bytes_per_s, self.at_once = seconds, bytes_per_s, at_once
         self._waited_for: Counter[str] = Counter()  # number of bodies being received, by client
         self._due: dict[asyncio.Task[Any], float | None] = {}  # deadline of each wait; None: it was cancelled
-        self._looking: asyncio.AbstractEventLoop | None = None
+        self._scheduled: asyncio.AbstractEventLoop | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on. Reading its body raises HTTPException with 413, 408 or 429."""
@@ -110,8 +110,8 @@ class BodyLimit:
             began = monotonic()
             self._waited_for[client] += 1
             self._due[task] = began - waited + self.seconds + seen / self.bytes_per_s
-            if self._looking is not task.get_loop():
-                self._look_later()
+            if self._scheduled is not task.get_loop():
+                self._schedule_check()
             try:
                 message = await receive()
             except asyncio.CancelledError:
@@ -134,20 +134,20 @@ class BodyLimit:
 
         await self.app(scope, limited, send)
 
-    def _look_later(self) -> None:
-        self._looking = asyncio.get_running_loop()
-        self._looking.call_later(min(0.5, self.seconds / 4), self._look)
+    def _schedule_check(self) -> None:
+        self._scheduled = asyncio.get_running_loop()
+        self._scheduled.call_later(min(0.5, self.seconds / 4), self._cancel_overdue)
 
-    def _look(self) -> None:
+    def _cancel_overdue(self) -> None:
         """Cancel the waits that are past their deadline."""
         now = monotonic()
         for task, due in self._due.items():
             if due is not None and due <= now:
                 self._due[task] = None
                 task.cancel()
-        self._looking = None
+        self._scheduled = None
         if self._due:
-            self._look_later()
+            self._schedule_check()
 
 
 def _too_large(limit: int) -> HTTPException:

@@ -16,7 +16,7 @@ from service.api.route import Route
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError
 from service.learning.learners import Learners
 from service.learning.live.feed import MAX_FOLLOWERS
-from service.learning.live.look import StatusReader
+from service.learning.live.status import StatusReader
 from service.telemetry.meters import Meters
 
 

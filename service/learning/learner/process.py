@@ -33,4 +33,4 @@ class LearnerProcess(Companion):
     def wake(self, model: str) -> None:
         """Report that a model's log has grown, or that other versions of it learn. Never waits for the process."""
         self._models.add(model)
-        self.give(model)
+        self.queue_work(model)

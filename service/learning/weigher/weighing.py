@@ -73,10 +73,10 @@ class Weighing:
 
         A process that starts only when their first rows arrive is seconds late.
         """
-        for model, version in self.loaded.held():
+        for model, version in self.loaded.versions_in_use():
             served = self.loaded.peek(model)
             if served is not None and served.version == version and served.carrier is not None:
-                self.process.give((model, version, ""))
+                self.process.queue_work((model, version, ""))
 
     def follow(self, monitor: Monitor, served: ServedModel, batch: NewBatch, screened: PredictedBatch) -> None:
         """Send a logged batch to the process, in the model's turn. Never waits for the process."""
@@ -98,7 +98,9 @@ class Weighing:
         if not has_posterior:
             posterior = served.model.posterior
             update = PosteriorUpdate(posterior.weights, posterior.root)
-        if self.process.give(stream, StreamRows(rows, batch.received, event, update, watch), most=MAX_WAITING_BATCHES):
+        if self.process.queue_work(
+            stream, StreamRows(rows, batch.received, event, update, watch), most=MAX_WAITING_BATCHES
+        ):
             self._forget_sent(stream)  # the dropped batch may have carried the state
             if batch.received - self._behind_at >= MIN_ALARM_PAUSE_S:
                 self._behind_at = batch.received
@@ -113,7 +115,7 @@ class Weighing:
             self._sent = {stream: each for stream, each in self._sent.items() if stream[0] != model}
             self._revisions = {version: each for version, each in self._revisions.items() if version[0] != model}
         if self.process.is_needed:
-            self.process.give(model)
+            self.process.queue_work(model)
 
     def handle_message(self, message: Message) -> None:
         """Act on a message of the process, in its reader's thread."""

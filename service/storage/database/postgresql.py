@@ -58,10 +58,10 @@ class Postgresql:
     def lock(self, connection: Connection, model: str | None = None) -> None:
         """Wait until no other writer of the model, or of any model, is left; the lock ends with the transaction."""
         if model is None:
-            _take(connection, "pg_advisory_xact_lock", WRITERS, ALL_MODELS)
+            _lock(connection, "pg_advisory_xact_lock", WRITERS, ALL_MODELS)
             return
-        _take(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL_MODELS)
-        _take(connection, "pg_advisory_xact_lock", WRITERS, _key(model))
+        _lock(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL_MODELS)
+        _lock(connection, "pg_advisory_xact_lock", WRITERS, _key(model))
 
     def pin(self, connection: Connection) -> None:
         """Make all reads of the transaction see the moment of its first read."""
@@ -71,7 +71,7 @@ class Postgresql:
     def turn(self, model: str) -> Iterator[None]:
         """Wait until no other service has the turn of the model; uses a connection of its own."""
         with self._turns.connect() as connection:
-            _take(connection, "pg_advisory_xact_lock", TURNS, _key(model))
+            _lock(connection, "pg_advisory_xact_lock", TURNS, _key(model))
             yield
 
     def changes_of_others(self, pause_s: float) -> Iterator[str | None]:
@@ -96,7 +96,7 @@ class Postgresql:
             connection.execute(text(f"SET LOCAL lock_timeout = {max(1, round(1000 * seconds))}"))
             if connection.scalar(text("SELECT pg_is_in_recovery()")):
                 raise OSError("the PostgreSQL server is a read-only standby")
-            _take(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL_MODELS)
+            _lock(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL_MODELS)
 
     def settle(self) -> None:
         """Do nothing: PostgreSQL stops if a sync of its log fails."""
@@ -164,7 +164,7 @@ def _read(url: str) -> URL:
         ) from None
 
 
-def _take(connection: Connection, function: str, kind: int, key: int) -> None:
+def _lock(connection: Connection, function: str, kind: int, key: int) -> None:
     connection.execute(text(f"SELECT {function}(:kind, :key)"), {"kind": kind, "key": key})
 
 

@@ -107,7 +107,7 @@ def test_python_client_reads_errors(vector):
 @each("text")
 def test_python_client_reads_texts(vector):
     exchange = Exchange("arm", 1)
-    exchange.take(vector["bytes"].decode())
+    exchange.receive(vector["bytes"].decode())
     if vector["name"] == "learnt":
         learnt = exchange.learnt
         rejected = sum(learnt.rejected.values())

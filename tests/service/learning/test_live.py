@@ -14,7 +14,7 @@ from service.foundation.errors import NotFoundError
 from service.learning.ingest.append import LoggedBatch
 from service.learning.live import feed
 from service.learning.live.feed import MAX_FOLLOWERS, MAX_UNREAD_EVENTS, Feed, FeedEvent, choose_rows, thin_batches
-from service.learning.live.look import find_quantile_bound
+from service.learning.live.status import find_quantile_bound
 from tests.service.data import error, eventually, service_of
 from tests.service.learning.batches import make_rows
 from tests.service.learning.event_listener import follow_model

@@ -188,7 +188,7 @@ def test_old_automatic_versions_are_deleted_unless_needed(learning_service, lear
 def test_candidate_waits_without_auto_promote(learning_service, learning_model):
     learning_model.put("learning", {"auto_promote": False})
     learning_service.publish(learning_model.name, candidate=True)
-    assert decide_refresh(learning_service, learning_model).startswith("waits")
+    assert decide_refresh(learning_service, learning_model).startswith("is a candidate")
     assert read_serving_versions(learning_model) == (1, 1)
     [alarm] = learning_model.get("alarms")["items"]
     assert alarm["evidence"] == {"serving": 1, "candidate": 2, "verdict": "promote", "promoted": False, **EVIDENCE}
@@ -200,5 +200,5 @@ def test_candidate_waits_without_auto_promote(learning_service, learning_model):
 def test_candidate_compared_with_retired_version_waits(learning_service, learning_model):
     learning_service.publish(learning_model.name, candidate=True)
     learning_service.publish(learning_model.name)
-    assert decide_refresh(learning_service, learning_model).startswith("waits")
+    assert decide_refresh(learning_service, learning_model).startswith("is a candidate")
     assert read_serving_versions(learning_model) == (3, 3)

@@ -61,7 +61,7 @@ BLOCKS = 2000
 PINNED = f"""
 import ctypes, os
 from pathlib import Path
-from service.runtime.allocator import give_back
+from service.runtime.allocator import release_memory
 library = ctypes.CDLL(None)
 library.malloc.restype = ctypes.c_void_p
 library.malloc.argtypes = [ctypes.c_size_t]
@@ -74,7 +74,7 @@ for block in blocks:
 for block in blocks[:-1]:
     library.free(block)
 before = resident()
-give_back()
+release_memory()
 print((before - resident()) / {BLOCKS * 50_000})
 """
 

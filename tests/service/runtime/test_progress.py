@@ -6,7 +6,7 @@ from math import inf
 
 import pytest
 
-from service.runtime.progress import LOOK_S, Progress, main_thread_s
+from service.runtime.progress import CHECK_S, Progress, main_thread_s
 from tests.service.data import eventually
 
 BUSY = "while True: pass"
@@ -35,7 +35,7 @@ class WatchedProcess:
         for _ in range(round(seconds)):
             self.now += 1.0
             self.spent = None if self.spent is None else self.spent + (0.02 if busy else 0.0)
-            answer = self.progress.look()
+            answer = self.progress.check()
         return answer
 
 
@@ -61,8 +61,8 @@ def test_time_without_looks_does_not_count():
     process = WatchedProcess()
     process.look_for(1)
     process.now += 1000.0  # the machine slept, or the watching process was suspended too
-    assert process.progress.look() is None
-    assert process.progress.silent_s <= 2 * LOOK_S + 1.0
+    assert process.progress.check() is None
+    assert process.progress.silent_s <= 2 * CHECK_S + 1.0
 
 
 @pytest.mark.skipif(main_thread_s(1) is None, reason="the system does not tell")
@@ -75,14 +75,14 @@ def test_only_the_main_thread_counts(source):
             now = iter(range(10**9))
             progress = Progress(lambda: (child.pid,), inf, inf, clock=lambda: float(next(now)))
             if source is BUSY:
-                progress.look()
+                progress.check()
                 progress.silent_s = 5.0
-                eventually(lambda: progress.look() is None and progress.silent_s == 0.0)
+                eventually(lambda: progress.check() is None and progress.silent_s == 0.0)
             else:
                 everything = eventually(lambda: (spent := all_threads_s(child.pid)) > 0.1 and spent)
-                progress.look()
+                progress.check()
                 eventually(lambda: all_threads_s(child.pid) > everything + 0.1)
-                progress.look()
+                progress.check()
                 assert progress.silent_s > 0.0
         finally:
             child.kill()

@@ -69,7 +69,7 @@ def test_reader_that_leaves_is_forgotten(no_worker, waiting):
 @pytest.fixture
 def following(table, monkeypatch):
     """A stream that often reads a table with one job."""
-    monkeypatch.setattr(feed, "LOOK_S", 0.01)
+    monkeypatch.setattr(feed, "CHECK_S", 0.01)
     table.add("x")
     return JobEventStream(table.database)
 
@@ -81,8 +81,8 @@ async def until_read(following):
 
 def test_many_readers_share_one_query(table, following, monkeypatch):
     """Each reader sees every lasting change, even if it comes late or its first row is stale."""
-    look = Mock(wraps=following._look)
-    monkeypatch.setattr(following, "_look", look)
+    look = Mock(wraps=following._read_rows)
+    monkeypatch.setattr(following, "_read_rows", look)
 
     async def follow_until(state, row):
         async for seen in following.follow(row, closing):

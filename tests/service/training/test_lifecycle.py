@@ -15,7 +15,7 @@ def verdict(looks, clock, stopped=None):
     """Return why a job watched since 100 s is ended at a time; looks: time and status of each look at its row."""
     given = WatchedJob("job_x", slot=None, future=None, since=100.0)
     for time, status in looks:
-        given.see(status, time)
+        given.update(status, time)
     if stopped is not None:
         given.stop(stopped)
     found = given.judge(SETTINGS, clock)

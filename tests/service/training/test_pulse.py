@@ -48,7 +48,7 @@ def test_short_database_failure_stops_nothing(table, heartbeat, monkeypatch, cap
 def test_hanging_work_has_no_heartbeat(table, heartbeat, monkeypatch, caplog):
     """The heartbeat's thread stays alive; only progress of the work counts."""
     wait_for_beat(table)
-    monkeypatch.setattr(heartbeat._progress, "look", lambda: "it has made no progress for 60 s")
+    monkeypatch.setattr(heartbeat._progress, "check", lambda: "it has made no progress for 60 s")
     eventually(lambda: "no more heartbeats are sent: it has made no progress for 60 s" in caplog.text)
     before = table.row(JOB).heartbeat_at
     table.change(JOB, cancel_requested=True)

@@ -51,7 +51,7 @@ def test_silent_process_is_reported(start_queue, monkeypatch):
     jobs = start_queue(workers.suspend_self, JobLimits(heartbeat_s=1000.0))
     jobs.running(jobs.submit("frozen"))
     monkeypatch.setattr(metrics, "SILENT_S", 0.1)
-    seen = eventually(lambda: (now := metrics.look(jobs.queue, lambda wrong: None))[0] == "warning" and now)
+    seen = eventually(lambda: (now := metrics.check_queue(jobs.queue, lambda wrong: None))[0] == "warning" and now)
     assert seen[1].startswith("0 jobs waiting, 1 running; a training process has made no progress for ")
 
 
@@ -122,7 +122,7 @@ def test_jobs_start_once_and_in_order(start_queue, monkeypatch):
     read = Mock()  # an idle queue does not read the database
     monkeypatch.setattr(jobs.queue.database, "session", read)
     for _ in range(5):
-        jobs.queue._inbox.put(jobs.queue._look)
+        jobs.queue._inbox.put(jobs.queue._check_jobs)
     eventually(jobs.queue._inbox.empty)
     assert not read.called
 

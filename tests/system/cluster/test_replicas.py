@@ -241,7 +241,7 @@ def _post_batch(pupil, number):
 
 def test_service_polls_without_notices(pair, arm, monkeypatch):
     first, second = arm
-    monkeypatch.setattr(replication, "FULL_LOOK_S", 0.2)
+    monkeypatch.setattr(replication, "FULL_CHECK_S", 0.2)
     for client in pair.clients:  # each takes the other's notices for its own
         monkeypatch.setattr(service_of(client).database, "origin", "the same")
     one, two = predict_at_revision((first, second), send_batches((first,), range(3)))
