@@ -100,6 +100,7 @@ def test_kept_times_increase_with_minimal_loss(honest: list[int], wrong: list[tu
 
 def test_times_outside_their_bounds_are_rejected() -> None:
     assert rejected_for_time([1.0, 2.0, 2.0, 3.0]) == [2]
+    assert rejected_for_time([1.0, 5.0, 2.0, 3.0, 4.0]) == [1]  # the one, not the three after it
     assert rejected_for_time([1.0, 2.0, 3.0, 4.0], after=2.0) == [0, 1]
     assert rejected_for_time([1.0, 2.0, 3.0, 4.0], before=3.0) == [2, 3]
     assert rejected_for_time([4.0, 5.0, 1e12], before=60.0) == [2]  # a jump into the future
