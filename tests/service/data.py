@@ -25,7 +25,7 @@ ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iteratio
 
 ADDRESS = "http://localhost"
 """Address of the service for an in-process client: without keys it accepts only names of this machine."""
-DEADLINE = 60.0
+DEADLINE = 300.0
 """Time limit for conditions that tests wait for, in seconds."""
 
 
