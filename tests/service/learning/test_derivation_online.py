@@ -95,6 +95,13 @@ def test_carried_rows_are_checked_once_acceleration_is_derived(learning_service,
     assert beyond[:HALF_WINDOW].any()
 
 
+def test_edge_rows_are_learnt_with_the_next_batch(learning_model):
+    first, second = (send_batch(learning_model, number, part) for number, part in enumerate(cut_batches([30])))
+    assert (first["accepted"], first["rejected"]) == (30 - 2 * HALF_WINDOW, {"edge": 2 * HALF_WINDOW})
+    assert (second["accepted"], second["rejected"]) == (ROWS - 30, {"edge": HALF_WINDOW})
+    assert second["derived"]["ddq"]["carried"] == HALF_WINDOW
+
+
 def test_unlearnt_batches_carry_no_rows(learning_model):
     first, second = cut_batches([30])
     send_batch(learning_model, 0, first)
