@@ -17,7 +17,7 @@ from service.foundation.errors import ConflictError
 from service.journal import log
 from service.journal.arrivals import MAX_RANGES, Gaps
 from service.journal.log import decode, encode
-from service.storage.database import SnapshotRow, now
+from service.storage.database import LearningRow, SnapshotRow, now
 from tests.service.learning.batches import (
     MODEL,
     OTHER,
@@ -60,6 +60,22 @@ def test_event_span_ignores_rows_without_valid_time(database):
     append_batches(database, make_batch(0, rows=leaps), make_batch(1, rows=leaps.take(slice(0, 2))))
     spans = [(event.first, event.last) for event in list_events(database)]
     assert spans == [(leaps.time[2], leaps.time[3]), (None, None)]
+
+
+@pytest.mark.parametrize(
+    ("options", "arrivals", "clocks"),
+    [
+        ({}, [1000.0, 1003.0, 1004.0], [1000.0, 1003.0, 1004.0]),
+        ({}, [1000.0, 10.0, 12.0], [1000.0, 1000.0, 1002.0]),  # the host's clock is set back
+        ({"forgetting_s": 5.0}, [1000.0, 9e9, 9e9 + 1.0], [1000.0, 1005.0, 1006.0]),  # it jumps ahead
+        ({"forgetting_s": 5.0, "friction_walk_s": 2.0}, [1000.0, 1003.0, 1004.0], [1000.0, 1002.0, 1003.0]),
+    ],
+)
+def test_clock_never_runs_back_and_advances_at_most_by_the_shortest_time_constant(database, options, arrivals, clocks):
+    with database.transaction() as session:
+        session.add(LearningRow(model=MODEL, options=options))
+    append_batches(database, *(make_batch(number, received=received) for number, received in enumerate(arrivals)))
+    assert [event.clock for event in list_events(database)] == clocks
 
 
 def test_unlearning_voids_a_batch_and_its_replays_only(database):
