@@ -58,7 +58,7 @@ def test_first_training_compiles_nothing_more(name: str) -> None:
 
 
 def test_unknown_names_are_rejected() -> None:
-    with pytest.raises(ValueError, match="expected only lip, lip-chain, rigid-body"):
+    with pytest.raises(ValueError, match="Compiled are lip, lip-chain, rigid-body"):
         warm_up("lip", "gpu")
 
 
