@@ -67,7 +67,7 @@ class Query(NamedTuple):
         except dynamics.IndefiniteInertiaError as error:
             raise invalid_request(
                 "q" if self.single else f"q[{error.index}]",
-                "a posture without a positive definite inertia matrix",
+                "a posture in which the learnt inertia matrix is not positive definite",
                 f"for {FORWARD} a posture near the training data",
             ) from error
 

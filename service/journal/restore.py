@@ -68,7 +68,7 @@ class RestoredState:
     number: int
     """Last event that `online` contains."""
     seen: int
-    """Last event that is considered for undoing."""
+    """Last event up to which undoing is taken into account."""
     torn: bool = False
     """Whether the newest snapshot is unreadable. If so, gaps of the log are skipped."""
 

@@ -26,7 +26,7 @@ def save(
 ) -> str | None:
     """Store a version's state after event `number` durably, delete snapshots beyond `most`, and return the id.
 
-    seen: last event that is considered for undoing. Return None and store nothing if the version has been
+    seen: last event up to which undoing is taken into account. Return None and store nothing if the version has been
     deleted, or if events in the state have been undone since.
     """
     snapshot = new_id("snap")

@@ -47,7 +47,7 @@ def limit_free_memory(environment: Mapping[str, str] = os.environ) -> bool:
         (Mallopt.TRIM_THRESHOLD, BLOCK_BYTES),
     )
     taken = [library.mallopt(parameter, value) for parameter, value in settings]
-    threading.Thread(target=_release_memory_often, name="give-back", daemon=True).start()
+    threading.Thread(target=_release_memory_often, name="release-memory", daemon=True).start()
     return all(taken)
 
 

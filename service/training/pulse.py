@@ -33,9 +33,9 @@ class PaceOptions:
     with the cube of their samples: measured 0.9 for two joints and 1.9 for seven.
     """
     fit_rows: int = 200_000
-    """Rows of a pass that takes about as long as a fit; for the displayed fraction."""
+    """A pass over so many rows takes about as long as a fit; for the displayed fraction."""
     last_fit_rows: int = 20_000
-    """Rows of a pass that takes about as long as the last fit, which does not search."""
+    """A pass over so many rows takes about as long as the last fit, which does not search."""
 
 
 PACE = PaceOptions()
@@ -158,7 +158,7 @@ class Heartbeat:
     def plan(self, fit: int, rows: int, later: int = 0) -> None:
         """Divide the remaining fraction among a fit that begins, a pass over `rows` rows, and the rest.
 
-        `fit` and `later` are in rows of a pass that takes as long; `later` is everything after the pass.
+        `fit` and `later` are numbers of rows: a pass over them takes as long. `later` is everything after the pass.
         """
         begins, total = self._latest.get("fraction", 0.0), fit + rows + later
         self._fit_begins = begins

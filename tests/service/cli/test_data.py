@@ -86,7 +86,7 @@ def test_same_recording_gives_the_same_data_set(run_command, recording, tmp_path
     for options in (("--cutoff", 3, "--filtering", "always"), ("--name", "another")):
         assert run_command("data", "add", path, *options, "--json")["id"] != first
     run_command("data", "delete", first, "--yes")
-    assert run_command("data", "add", path, "--json")["id"] != first  # what was deleted is stored anew
+    assert run_command("data", "add", path, "--json")["id"] != first  # the deleted data set is not reused
 
 
 @pytest.mark.slow

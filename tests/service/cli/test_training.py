@@ -234,11 +234,11 @@ def test_hold_out_only_data_are_never_learnt(run_command, server, recording):
 
 
 def test_job_id_is_printed_before_the_end(run_on_server, server, recording):
-    code, out, err = run_on_server("train", recording(17), "--model", "cli-told", *QUICKLY)
-    assert (code, "cli-told version 1 trained" in out) == (0, True), err
-    (job,) = jobs_of(server, "cli-told")
-    told = f"{job} is queued: `lipserve jobs follow {job}` also follows it"
-    assert err.index(told) < err.index("100 %")
+    code, out, err = run_on_server("train", recording(17), "--model", "cli-queued", *QUICKLY)
+    assert (code, "cli-queued version 1 trained" in out) == (0, True), err
+    (job,) = jobs_of(server, "cli-queued")
+    queued = f"{job} is queued: `lipserve jobs follow {job}` also follows it"
+    assert err.index(queued) < err.index("100 %")
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from lipserve import Client
 from tests.service.data import eventually
 from tests.service.learning.learning_models import max_difference
 from tests.service.learning.recordings import (
+    assert_learnt,
     make_recording,
     make_request,
-    predict_after_learning,
     read_logged_rows,
     send_batch,
     slice_recording,
@@ -29,12 +29,6 @@ def body():
 
 def slice_rows(first, last):
     return slice_recording(make_recording(), first, last)
-
-
-def assert_learnt(learning_service, learning_model, revision, body, *weight):
-    """Check the predictions of a revision against lipcore's after learning these rows."""
-    expected = predict_after_learning(learning_service, body, *weight)
-    assert max_difference(learning_model.wait_for_revision(revision), expected) < MAX_DIFFERENCE
 
 
 def test_batch_is_acknowledged_and_learnt(learning_service, learning_model, body):

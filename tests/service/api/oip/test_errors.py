@@ -114,7 +114,9 @@ def test_singular_inertia_error_names_the_query(api, trained, monkeypatch):
     monkeypatch.setattr(dynamics, "inertia_matrix", lambda *_: singular)
     batch = {name: np.tile(values, (3, 1)) for name, values in (MOTION | {"tau": [0.0, 0.0]}).items()}
     reply = rejection(api, message(batch, "forward_dynamics"))
-    assert reply.startswith("q[1] is a posture without a positive definite inertia matrix, expected for")
+    assert reply.startswith(
+        "q[1] is a posture in which the learnt inertia matrix is not positive definite, expected for"
+    )
 
 
 @pytest.mark.parametrize("rows", [1, 2])

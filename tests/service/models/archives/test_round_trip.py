@@ -47,7 +47,7 @@ def test_imported_version_answers_alike_bit_for_bit(api, trained, archive):
 
 
 def test_imported_version_names_its_origin(api, trained, archive):
-    version = imported(api, archive, name="told")
+    version = imported(api, archive, name="import-again")
     original = api.get(f"/v1/models/{trained.name}/versions/1").json()
     origin = version["lineage"].pop("imported")
     assert version["lineage"] == original["lineage"]
@@ -55,8 +55,8 @@ def test_imported_version_names_its_origin(api, trained, archive):
     assert version["job"] is None
     for name in ("joint_names", "noise_std", "options", "fit", "compact", "calibration", "training_range"):
         assert version[name] == original[name]
-    again = imported(api, exported(api, "told", version=1), name="told")
-    assert [each["model"] for each in again["lineage"]["imported"]] == [trained.name, "told"]
+    again = imported(api, exported(api, "import-again", version=1), name="import-again")
+    assert [each["model"] for each in again["lineage"]["imported"]] == [trained.name, "import-again"]
     assert again["version"] == 2
 
 
