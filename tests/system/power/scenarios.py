@@ -285,7 +285,7 @@ def run_lifetime(service: RecordedService, rounds: int) -> None:
     trained = service.upload(1)
     for version in (1, 2):
         service.train(ARM, trained, version)
-    service.settings()
+    service.change_learning()
     for each in range(rounds):
         service.run_concurrently(
             lambda at=each: _run_uploads(service, at),
