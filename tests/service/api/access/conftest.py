@@ -14,7 +14,7 @@ from service.api.access.scopes import SCOPES
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from tests.service.cli.conftest import lipserve, run_command  # noqa: F401 - fixtures
+from tests.service.cli.conftest import lipserve, run_command, run_on_server  # noqa: F401 - fixtures
 from tests.service.data import eventually
 
 REFRESH_S = 0.05

@@ -84,7 +84,7 @@ def fail_requests(monkeypatch):
     [
         (PermissionError("User: arn:secret is not allowed"), "access is denied"),
         (TimeoutError(), "in time"),
-        (OSError(errno.EIO, "Reduce your rate"), "refuses"),
+        (OSError(errno.EIO, "Reduce your rate"), "rejects the request"),
     ],
 )
 def test_bucket_error_is_reported_without_secrets(bucket, tmp_path, fail_requests, raised, words):
