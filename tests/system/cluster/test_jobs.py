@@ -14,7 +14,6 @@ from tests.system.cluster import light
 from tests.system.cluster.jobs import queues
 from tests.system.cluster.workers import cluster
 
-WAITING_MESSAGE = "waits for a worker of the cluster"
 LOST_WORKER_MESSAGE = "the worker that ran the job is gone: queued again"
 
 
@@ -95,7 +94,7 @@ def test_gpu_job_waits_for_worker_with_gpu(cluster_services, workers):
     job, plain = queue.add("gpu", "wait", device="cuda"), queue.add("plain", "finish")
     assert queue.ended(plain).state == "succeeded"
     row = queue.row(job)
-    assert (row.state, messages_of(row)) == ("queued", [f"{WAITING_MESSAGE} with a GPU"])
+    assert (row.state, messages_of(row)) == ("queued", ["waiting for a worker of the cluster with a GPU"])
     assert queue.cluster.gpus == 0
     workers.start("two", "--gpus", "1")
     process = queue.running(job).progress["process"]
