@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import create_engine
 
 from service.storage.database.migrations import HEAD, revision
-from tests import ROOT
+from tests import ROOT, unpack
 from tests.service.data import DEADLINE, QUICK, eventually, queue, stream, train, upload
 from tests.service.learning.learning_models import QUERIES
 from tests.service.server import Server
@@ -45,7 +45,7 @@ def release_before(tmp_path_factory):
         made = subprocess.run(["git", "archive", name, *FOLDERS], cwd=ROOT, capture_output=True, check=False)
         if made.returncode == 0:
             with tarfile.open(fileobj=io.BytesIO(made.stdout)) as tar:
-                tar.extractall(folder, filter="data")
+                unpack(tar, folder)
             keep_compiled(folder)
             return folder
     pytest.skip(f"git knows none of {', '.join(RELEASE_BEFORE)}: a clone without its history")

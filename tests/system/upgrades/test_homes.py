@@ -22,6 +22,7 @@ from service.foundation.settings import Settings
 from service.storage.backup import backup, restore
 from service.storage.database import Database
 from service.storage.database.migrations import HEAD
+from tests import unpack
 from tests.service.api.access.conftest import bearer
 from tests.service.data import QUICK, ended, eventually, queue
 
@@ -40,7 +41,7 @@ MAX_DIFFERENCE, MAX_LEARNT_DIFFERENCE = 1e-9, 1e-7
 def unpack_home(folder):
     home = folder / "home"
     with tarfile.open(HERE / f"home-{RELEASE}.tar.xz") as tar:
-        tar.extractall(home, filter="data")
+        unpack(tar, home)
     return home
 
 
