@@ -43,6 +43,10 @@ TORCH_ESTIMATORS = ("se", "gip", "lse")
 """Estimators that torch differentiates in training, on a GPU if there is one. They need the extra `train`; their
 predictions do not."""
 
+DriveKind = Literal["stribeck", "speed", "sides", "load"]
+DRIVE_KINDS: tuple[DriveKind, ...] = get_args(DriveKind)
+"""Kinds of friction beyond viscous, Coulomb and offset (`lipcore.kernels.drive.terms`)."""
+
 GeometryMode = Literal["learn", "calibrate", "fixed"]
 GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
 """How the joint axes of rigid bodies are found: learnt from torque alone, learnt around a URDF or the arm of another

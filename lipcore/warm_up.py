@@ -16,6 +16,7 @@ from lipcore.data.samples import Samples
 from lipcore.estimators.options import FitOptions
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
+from lipcore.kernels.drive.terms import drive_terms
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.training.train import train
@@ -55,7 +56,7 @@ def _swinging() -> Samples:
 
 def _of_arm(arm: Arm) -> None:
     """Compile the kernels that only a training on another recording needs: other arms or none, and the energies."""
-    friction = np.zeros((arm.n_joints, 4 if arm.stribeck else 3))
+    friction = np.zeros((arm.n_joints, len(drive_terms(arm.drive))))
     one = Alternative(arm.geometry, arm.parameters, np.zeros(arm.n_joints), friction, 0.5)
     zeros = np.zeros((1, arm.n_joints))
     motion = Motion(zeros, zeros, zeros)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from lipcore.data.samples import Array
-from lipcore.kernels.friction import FRICTION_TERMS, friction_features
+from lipcore.kernels.drive.terms import BASE_TERMS, drive_features
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
 
@@ -53,7 +53,7 @@ class FourierModel:
         params, n = fitted.posterior.params, fitted.n_joints
         normal = np.random.default_rng(seed).standard_normal((n, 3 * n, features // 2))
         lengthscales = np.exp(params["se.log_lengthscales"])
-        size = 2 * (features // 2) + len(FRICTION_TERMS)
+        size = 2 * (features // 2) + len(BASE_TERMS)
         return cls(
             normal / lengthscales[:, :, None],
             np.exp(0.5 * params["se.log_scale"]),
@@ -93,7 +93,7 @@ class FourierModel:
     def _features(self, q: Array, dq: Array, ddq: Array) -> list[Array]:
         """Return φ of every joint, (N, P) each."""
         state = np.concatenate([q, dq, ddq], axis=1)
-        friction = friction_features(dq)  # (3, N, n)
+        friction = drive_features(dq)  # (3, N, n)
         found = []
         for joint, frequencies in enumerate(self.frequencies):
             phase = state @ frequencies

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from lipcore.arm import right_angles
-from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
+from lipcore.arm.drive import choose_drive
+from lipcore.arm.posing import make_problem, mode_of, surroundings, with_load, with_samples
 from lipcore.arm.problem import WIDTHS, Point, Problem, root_of
 from lipcore.arm.right_angles import Candidate, Layout
 from lipcore.arm.scales import rescale
@@ -22,8 +23,8 @@ from lipcore.estimators import noise
 from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress
 from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Alternative, Arm, chain
+from lipcore.kernels.drive.terms import summary_rows
 from lipcore.kernels.fast.arm import PARAMETERS
-from lipcore.kernels.friction import FRICTION_TERMS
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.selection import spread_out
@@ -47,10 +48,7 @@ class ArmOptions:
     """Min difference in torque of an alternative arm, as a share of the stated spread."""
     check_motions: int = 200
     """Motions at which arms are compared."""
-    min_stribeck_nats: float = 3.0
-    """Min gain of the fourth term of friction: odds of twenty to one, from independent samples. On simulated arms
-    without such friction the term lost two to seven nats if every row counted."""
-    stribeck_rounds: int = 2
+    drive_rounds: int = 2
     rest_rounds: int = 2
     max_contiguous_rows: int = 20_000
     """Max contiguous rows for the estimate of the lasting part of the errors."""
@@ -120,7 +118,7 @@ def learn(
         )
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        found, stribeck_nats = _refine(problem, ends, counting, watch, known if mode == "learn" else None)
+        found, drive_nats = _refine(problem, ends, counting, watch, known if mode == "learn" else None, rows)
         best, problem = found[0].point, found[0].problem
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
@@ -129,8 +127,8 @@ def learn(
             report |= _search_report(result, ends, found)
         report |= {
             "objective": best.value,
-            "friction_terms": problem.friction_terms,
-            "stribeck_nats": stribeck_nats,
+            "drive": ", ".join(problem.drive.kinds),
+            "drive_nats": drive_nats,
             "iterations": watch.iteration,
             "converged": result is None or result.ended == "idle",
             "samples_given": len(samples),
@@ -146,7 +144,7 @@ def learn(
         arm, params = _arm(found, order, mode)
         place, n = np.argsort(order), problem.n_joints
         friction = problem.weights(best)[problem.bodies :].reshape(n, -1)
-        misfit = misfit.with_friction(friction[:, FRICTION_TERMS.index("coulomb")]).of_joints(place)
+        misfit = misfit.with_friction(friction @ summary_rows(problem.drive.kinds)["coulomb"]).of_joints(place)
         return ArmFit(arm, params, rows, problem.counts[:, place], misfit, report)
 
 
@@ -201,11 +199,12 @@ def _refine(
     counting: _Counting,
     watch: _Watch,
     known: Sequence[Geometry] | None,
+    rows: NDArray[np.int64],
 ) -> tuple[list[Candidate], float]:
-    """Return the most likely arm with those nearly as likely, and the gain in nats of friction's fourth term.
+    """Return the most likely arm with those nearly as likely, and the gain in nats of the drive's kinds.
 
-    All have the scales and the noise of the first. The fourth term is included if the evidence supports it. known:
-    geometries for the search for right angles, if the geometry is learnt without a prior; else None.
+    All have the scales, the noise and the drive of the first. known: geometries for the search for right angles, if
+    the geometry is learnt without a prior; else None; rows: (N,), the problem's samples in order of time.
     """
     best, problem = _alternate(problem, ends[0], OPTIONS.rounds, 0.85, watch)
     free: Layout = (None,) * problem.n_joints
@@ -215,16 +214,14 @@ def _refine(
         chosen = right_angles.likely_layouts(problem, [best, *ends[1:]], known, watch.stop)
         starts = [*((each.layout, each.problem.expected, each.point) for each in chosen), *starts]
         problem = replace(problem, expected=starts[0][1])
-        best, problem = _alternate(problem, starts[0][2], OPTIONS.stribeck_rounds, 0.87, watch)
-    wider = with_stribeck(problem)
-    start = wider.at(best.geometry, best.sigma)
-    gain = rescale(problem, best).value - rescale(wider, start).value
-    if gain > OPTIONS.min_stribeck_nats:
-        best, problem = _alternate(wider, start, OPTIONS.stribeck_rounds, 0.88, watch)
+        best, problem = _alternate(problem, starts[0][2], OPTIONS.drive_rounds, 0.87, watch)
+    choice = choose_drive(problem, best, rows, watch.stop)
+    if choice.problem.drive.kinds:
+        best, problem = _alternate(choice.problem, choice.point, OPTIONS.drive_rounds, 0.88, watch)
     for number in range(OPTIONS.rest_rounds):
-        problem = counting.applied(problem, best, at_rest=True)
+        problem = counting.applied(with_load(problem, best), best, at_rest=True)
         best, problem = _alternate(
-            problem, problem.at(best.geometry, best.sigma), OPTIONS.stribeck_rounds, 0.9 + 0.02 * number, watch
+            problem, problem.at(best.geometry, best.sigma), OPTIONS.drive_rounds, 0.9 + 0.02 * number, watch
         )
     found = [right_angles.weigh(problem, best, starts[0][0])]
     for layout, expected, other in starts[1:]:
@@ -232,7 +229,7 @@ def _refine(
         end = posed.descend(other.geometry, best.sigma, OPTIONS.round_steps, watch.stop, noise=False)
         found.append(right_angles.weigh(posed, end, layout))
     found.sort(key=lambda each: each.evidence)
-    return [each for each in found if each.evidence < found[0].evidence + right_angles.OPTIONS.near_nats], gain
+    return [each for each in found if each.evidence < found[0].evidence + right_angles.OPTIONS.near_nats], choice.nats
 
 
 def _alternate(problem: Problem, point: Point, rounds: int, fraction: float, watch: _Watch) -> tuple[Point, Problem]:
@@ -269,7 +266,7 @@ def _arm(found: Sequence[Candidate], order: NDArray[np.int64], mode: GeometryMod
         problem.centre[PARAMETERS * n : first][place],
         np.zeros(0) if expected is None else expected.step(best.geometry),
         np.zeros(0) if expected is None else expected.widths,
-        problem.friction_terms > len(FRICTION_TERMS),
+        problem.drive.kinds,
     )
     differing = [each for each in found[1:] if _differs(problem, best, each.point)]
     if not differing:

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.arm.problem import GeometryPrior, Problem
+from lipcore.arm.problem import Drive, GeometryPrior, Point, Problem
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators import noise
 from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_from_torque
+from lipcore.kernels.drive.terms import BASE_TERMS, check_kinds, drive_terms
 from lipcore.kernels.fast.arm import PARAMETERS
-from lipcore.kernels.friction import FRICTION_TERMS, friction_features
 from lipcore.kernels.geometry import Geometry
-from lipcore.vocabulary import GeometryMode, JointType
+from lipcore.vocabulary import DriveKind, GeometryMode, JointType
 
 
 def mode_of(task: Task) -> GeometryMode:
@@ -69,7 +69,7 @@ def make_problem(
     floor, start = noise.floor(every)[order], noise.start(every)[order]
     speed = np.maximum(np.sqrt(np.mean(every.dq**2, axis=0))[order], 1e-3)
     # the prior std of a joint's friction weights is its torque
-    friction = np.stack([usual / speed, usual, usual], axis=1).reshape(-1) + floor.repeat(len(FRICTION_TERMS))
+    friction = np.stack([usual / speed, usual, usual], axis=1).reshape(-1) + floor.repeat(len(BASE_TERMS))
     anywhere = unit_from_torque(float(usual.max()), n)
     body, centre = anywhere, np.zeros((PARAMETERS + 1) * n)
     if around is not None:
@@ -82,7 +82,7 @@ def make_problem(
         motions,
         tau,
         np.ones(tau.shape),
-        joint_friction(motions[:, 1]),
+        Drive().features(motions),
         np.concatenate([centre, np.zeros(len(friction))]),
         unit,
         unit,
@@ -95,7 +95,7 @@ def make_problem(
 def with_samples(problem: Problem, samples: Samples, order: NDArray[np.int64]) -> Problem:
     """Return the same problem with N other samples of weight one. order: (n,), as in `make_problem`."""
     motions, tau = _in_chain(samples, order)
-    friction = joint_friction(motions[:, 1], problem.friction_terms > len(FRICTION_TERMS))
+    friction = problem.drive.features(motions)
     return replace(problem, motions=motions, tau=tau, counts=np.ones(tau.shape), friction=friction)
 
 
@@ -119,29 +119,37 @@ def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -
     return GeometryPrior.anything(any_arm)
 
 
-def with_stribeck(problem: Problem) -> Problem:
-    """Return the same problem with friction's fourth term. Its prior is that of the Coulomb term."""
-    n, first = problem.n_joints, problem.bodies
-    known, scaled = (each[first:].reshape(n, -1) for each in (problem.unit, problem.scale))
-    coulomb = known[:, FRICTION_TERMS.index("coulomb"), None]
-    unit, scale = (np.concatenate([each, coulomb], axis=1).reshape(-1) for each in (known, scaled))
+def with_kind(problem: Problem, point: Point, kind: DriveKind) -> Problem:
+    """Return the same problem with another kind of friction. The load is that of a point's bodies.
+
+    The prior std of a new term is that of the Coulomb term, for the term's largest size in the samples.
+    """
+    n, first, before = problem.n_joints, problem.bodies, problem.drive
+    kinds = check_kinds((*before.kinds, kind))
+    drive = Drive(kinds, (point.geometry, problem.parameters(point)) if "load" in kinds else None)
+    terms, known = drive_terms(kinds), drive_terms(before.kinds)
+    largest = np.abs(drive.by_joint(problem.motions)).max(axis=1)  # (f, n)
+    unit, scale = np.empty((2, n, len(terms)))
+    for values, old in ((unit, problem.unit), (scale, problem.scale)):
+        of_joint = old[first:].reshape(n, -1)
+        for place, term in enumerate(terms):
+            if term in known:
+                values[:, place] = of_joint[:, known.index(term)]
+            else:
+                values[:, place] = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[place], 1e-3)
     return replace(
         problem,
-        friction=joint_friction(problem.motions[:, 1], stribeck=True),
-        centre=np.concatenate([problem.centre[:first], np.zeros(len(unit))]),
-        scale=np.concatenate([problem.scale[:first], scale]),
-        unit=np.concatenate([problem.unit[:first], unit]),
+        friction=drive.features(problem.motions),
+        drive=drive,
+        centre=np.concatenate([problem.centre[:first], np.zeros(unit.size)]),
+        scale=np.concatenate([problem.scale[:first], scale.reshape(-1)]),
+        unit=np.concatenate([problem.unit[:first], unit.reshape(-1)]),
     )
 
 
-def joint_friction(dq: Array, stribeck: bool = False) -> Array:
-    """Return the friction features P of N velocities, joint by joint, (N, n, f n) (section 5 of docs/method.md).
-
-    dq: (N, n) rad/s or m/s; stribeck: whether friction has its fourth term.
-    """
-    size, n = dq.shape
-    features = friction_features(np.ascontiguousarray(dq), stribeck)  # (f, N, n)
-    out = np.zeros((size, n, n, len(features)))
-    joints = np.arange(n)
-    out[:, joints, joints] = features.transpose(1, 2, 0)
-    return out.reshape(size, n, -1)
+def with_load(problem: Problem, point: Point) -> Problem:
+    """Return the same problem with the load of a point's bodies."""
+    if "load" not in problem.drive.kinds:
+        return problem
+    drive = Drive(problem.drive.kinds, (point.geometry, problem.parameters(point)))
+    return replace(problem, drive=drive, friction=drive.features(problem.motions))

@@ -17,8 +17,10 @@ from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from lipcore.data.motion import Indices
 from lipcore.data.samples import Array
-from lipcore.kernels.fast.arm import PARAMETERS, arm_masses, arm_shapes
+from lipcore.kernels.drive.terms import drive_features, drive_terms
+from lipcore.kernels.fast.arm import PARAMETERS, arm_masses, arm_shapes, arm_torques
 from lipcore.kernels.geometry import Geometry
+from lipcore.vocabulary import DriveKind
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,38 @@ class Point:
 
 
 @dataclass(frozen=True)
+class Drive:
+    """Friction of the joints, base to tip."""
+
+    kinds: tuple[DriveKind, ...] = ()
+    """Kinds beyond viscous, Coulomb and offset."""
+    carried: tuple[Geometry, Array] | None = None
+    """Bodies that are the load: their geometry and inertial parameters, (n, 10); None without the kind `load`."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of a joint's terms, (f,)."""
+        return drive_terms(self.kinds)
+
+    def by_joint(self, motions: Array) -> Array:
+        """Return each joint's terms, (f, N, n). motions: (N, 3, n)."""
+        load = None
+        if self.carried is not None:
+            (geometry, bodies), load = self.carried, np.empty((len(motions), motions.shape[2]))
+            arm_torques(geometry.constants, geometry.gravity, bodies, np.arange(motions.shape[2]), motions, load)
+            load = np.abs(load)
+        return drive_features(np.ascontiguousarray(motions[:, 1]), self.kinds, load)
+
+    def features(self, motions: Array) -> Array:
+        """Return the features P of N motions, joint by joint, (N, n, f n) (section 5 of docs/method.md)."""
+        terms = self.by_joint(motions)
+        (f, size, n), joints = terms.shape, np.arange(terms.shape[2])
+        out = np.zeros((size, n, n, f))
+        out[:, joints, joints] = terms.transpose(1, 2, 0)
+        return out.reshape(size, n, -1)
+
+
+@dataclass(frozen=True)
 class Problem:
     """Samples, with the prior of the arm that is learnt from them."""
 
@@ -93,7 +127,7 @@ class Problem:
     counts: Array
     """Independent measurements that each torque represents, (N, n)."""
     friction: Array
-    """Features of friction, (N, n, f n)."""
+    """Features of friction, (N, n, f n), those of `drive`."""
     centre: Array
     """μ, prior mean of w, (k,)."""
     scale: Array
@@ -106,6 +140,8 @@ class Problem:
     """Min noise, (n,) N·m."""
     expected: GeometryPrior | None
     """Prior of the geometry, None if it is fixed."""
+    drive: Drive = Drive()
+    """Terms of friction."""
     scale_width: float = WIDTHS.scale
     """Prior standard deviation of the parts of the logarithms of s, except those of friction."""
 
@@ -118,11 +154,6 @@ class Problem:
     def bodies(self) -> int:
         """Number of weights of masses and rotors, which come before those of friction."""
         return (PARAMETERS + 1) * self.n_joints
-
-    @property
-    def friction_terms(self) -> int:
-        """Terms of a joint's friction: f = 3, or 4 with additional friction at low speed."""
-        return int(self.friction.shape[2]) // self.n_joints
 
     def rows(self, rows: Indices) -> Problem:
         """Return the same problem with some of the samples. rows: indices, or a mask (N,)."""
@@ -140,7 +171,7 @@ class Problem:
         motions = np.stack([self.motions[rows[part], part] for part in range(3)], axis=1)
         nothing = np.zeros((size, self.n_joints))
         return replace(
-            self, motions=motions, tau=nothing, counts=np.ones_like(nothing), friction=self.friction[rows[1]]
+            self, motions=motions, tau=nothing, counts=np.ones_like(nothing), friction=self.drive.features(motions)
         )
 
     def mean(self, point: Point) -> Array:

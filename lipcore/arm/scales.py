@@ -21,6 +21,7 @@ from scipy.linalg import solve_triangular
 from lipcore.arm.problem import Point, Problem, root_of
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS
+from lipcore.kernels.drive.terms import BASE_TERMS
 from lipcore.kernels.fast.arm import PARAMETERS
 
 
@@ -33,6 +34,8 @@ class ScaleOptions:
     min_friction_share: float = 0.1
     """Min standard deviation of a friction torque, as a share of its joint's root mean square torque, which is the
     max."""
+    min_kind_share: float = 1e-3
+    """The same for the kinds of friction that a recording has to support."""
     pooling_width: float = 0.7
     """Prior standard deviation of the logarithm of a joint's friction deviation around the mean of all joints."""
     min_count: float = 40.0
@@ -72,9 +75,10 @@ def rescale(problem: Problem, point: Point) -> ScaleFit:
     evidence = _Evidence.around(problem, point)
     parts, masses = _parts(n, k), BODY_KINDS + n + 1
     frictions = k - problem.bodies
-    bounds = [(-OPTIONS.max_log_share, OPTIONS.max_log_share)] * masses + [
-        (float(np.log(OPTIONS.min_friction_share)), 0.0)
-    ] * frictions
+    least = np.full(len(problem.drive.names), np.log(OPTIONS.min_kind_share))
+    least[: len(BASE_TERMS)] = np.log(OPTIONS.min_friction_share)
+    bounds = [(-OPTIONS.max_log_share, OPTIONS.max_log_share)] * masses
+    bounds += [(float(each), 0.0) for each in np.tile(least, n)]
     width = np.repeat([problem.scale_width, OPTIONS.pooling_width], [masses, frictions])
 
     def negative(shares: Array) -> tuple[float, Array]:

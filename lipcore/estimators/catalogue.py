@@ -18,7 +18,7 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
-from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.local import LocalKernel
@@ -84,8 +84,8 @@ def make_estimator(
     if name not in ESTIMATORS:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
     types = check_joint_types(joint_types)
-    friction = FrictionKernel(len(types), arm is not None and arm.stribeck)
-    terms = {**ESTIMATORS[name](types, tied), "friction": friction}
+    drive = DriveKernel(len(types), () if arm is None else arm.drive, arm)
+    terms = {**ESTIMATORS[name](types, tied), "friction": drive}
     if (name in ROBOT_ESTIMATORS) != (arm is not None):
         raise ValueError(f"estimator {name!r}: only {', '.join(ROBOT_ESTIMATORS)} need an arm, others must have none")
     if arm is None:

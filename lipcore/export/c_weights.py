@@ -11,8 +11,8 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
-from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.body import LOWER_TRIANGLE
 from lipcore.model.torque_model import TorqueModel
@@ -29,7 +29,7 @@ class LinearWeights:
     """The posterior of a model's p weights."""
 
     arm: ArmKernel
-    friction: FrictionKernel
+    friction: DriveKernel
     mean: Array
     """Mean of all weights, the arm's first, (p,)."""
     prior_scaled_root: Array
@@ -45,7 +45,7 @@ class LinearWeights:
         posterior, terms = model.posterior, model.estimator.terms
         arm, friction = terms["rigid_body"], terms["friction"]
         assert isinstance(arm, ArmKernel)
-        assert isinstance(friction, FrictionKernel)
+        assert isinstance(friction, DriveKernel)
         if list(posterior.basis.linear) != [arm, friction]:
             raise UnsupportedEstimatorError("the posterior has weights other than those of rigid bodies and friction")
         diagonals = [each.variances(posterior.params) for each in (arm, friction)]

@@ -28,14 +28,14 @@ from lipcore.export.c_weights import (
     move_parameters,
 )
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.drive.terms import SHAPE_SPEEDS, SIGN_WIDTH, STRIBECK_SPEED
 from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
-from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.model.body import Body
 from lipcore.model.torque_model import TorqueModel
-from lipcore.vocabulary import ROBOT_ESTIMATORS
+from lipcore.vocabulary import DRIVE_KINDS, ROBOT_ESTIMATORS
 
 SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
 WIDE = 8
@@ -110,6 +110,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
     return {
         "n": str(n),
         "friction": str(rubbing.shape[1]),
+        **{kind: str(int(kind in learnt.friction.kinds)) for kind in DRIVE_KINDS},
         "bodies": str(sum(counts)),
         "steps": str(arm.steps),
         "others": str(others),
@@ -123,6 +124,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "tip": _braced(axes_of(arm.geometry)[-1].T.reshape(-1)),
         "sign_width": repr(SIGN_WIDTH),
         "slow_speed": repr(STRIBECK_SPEED),
+        "shapes": _braced(SHAPE_SPEEDS),
         "accelerated": repr(ACCELERATED),
         "quantile": repr(quantile(LEVEL)),
         "arm": table,

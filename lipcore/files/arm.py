@@ -9,9 +9,9 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.files.strict_json import quote
 from lipcore.kernels.arm_prior import Alternative, Arm
-from lipcore.kernels.friction import friction_terms
+from lipcore.kernels.drive.terms import drive_terms
 from lipcore.kernels.geometry import Geometry
-from lipcore.vocabulary import GeometryMode, JointType
+from lipcore.vocabulary import DRIVE_KINDS, DriveKind, GeometryMode, JointType
 
 PREFIX = "arm/"
 _GEOMETRY_TENSORS = ("rotation", "translation", "axis", "gravity")
@@ -24,6 +24,7 @@ _TENSORS = {
         *_ARM_TENSORS,
         "order",
         "rotor",
+        "drive",
         "stribeck",
         *(f"other/{name}" for name in _ALTERNATIVE_TENSORS),
     )
@@ -43,8 +44,8 @@ def arm_tensors(arm: Arm) -> dict[str, Array]:
     parts["order"] = arm.order.astype(np.float64)
     if arm.rotor.any():
         parts["rotor"] = arm.rotor
-    if arm.stribeck:
-        parts["stribeck"] = np.ones(1)
+    if arm.drive:
+        parts["drive"] = np.array([float(kind in arm.drive) for kind in DRIVE_KINDS])
     if each := arm.alternatives:
         parts |= {
             "other/rotation": np.stack([one.geometry.rotation for one in each]),
@@ -74,18 +75,22 @@ def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mod
     geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY_TENSORS))
     rotor = tensors.get(f"{PREFIX}rotor")  # rotors of zero inertia are not stored
     parts["rotor"] = np.zeros(len(types)) if rotor is None else rotor
-    stribeck = _stribeck(tensors)
-    alternatives = _alternatives(tensors, geometry, len(friction_terms(stribeck)))
-    return Arm(geometry, order, mode, stribeck=stribeck, alternatives=alternatives, **parts)
+    drive = _drive(tensors)
+    alternatives = _alternatives(tensors, geometry, len(drive_terms(drive)))
+    return Arm(geometry, order, mode, drive=drive, alternatives=alternatives, **parts)
 
 
-def _stribeck(tensors: Mapping[str, Array]) -> bool:
-    """Return whether friction has its fourth term; False if nothing is stored."""
-    if (stored := tensors.get(f"{PREFIX}stribeck")) is None:
-        return False
-    if (values := stored.tolist()) not in ([0.0], [1.0]):
-        raise ValueError(f"tensor 'arm/stribeck' is {quote(values)}, expected [0.0] or [1.0]")
-    return bool(values[0])
+def _drive(tensors: Mapping[str, Array]) -> tuple[DriveKind, ...]:
+    """Return the kinds of the drive; none if nothing is stored. Earlier releases stored `stribeck` alone."""
+    kinds: list[DriveKind] = []
+    for name, offered in (("stribeck", DRIVE_KINDS[:1]), ("drive", DRIVE_KINDS)):
+        if (stored := tensors.get(f"{PREFIX}{name}")) is None:
+            continue
+        values = stored.tolist()
+        if stored.shape != (len(offered),) or not set(values) <= {0.0, 1.0}:
+            raise ValueError(f"tensor 'arm/{name}' is {quote(values)}, expected {len(offered)} numbers, each 0 or 1")
+        kinds = [kind for kind, value in zip(offered, values, strict=True) if value]
+    return tuple(kinds)
 
 
 def _alternatives(tensors: Mapping[str, Array], geometry: Geometry, terms: int) -> tuple[Alternative, ...]:

@@ -48,12 +48,13 @@ class Estimate(Entry):
 
 
 class Friction(Entry):
-    """See `lipcore.kernels.friction`."""
+    """See `lipcore.model.parameters.Friction`."""
 
     viscous: Estimate
     coulomb: Estimate
     offset: Estimate
     stribeck: Estimate | UnsetType = UNSET
+    load: Estimate | UnsetType = UNSET
 
 
 class BodyParameters(Entry):

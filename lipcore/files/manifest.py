@@ -92,6 +92,9 @@ class Fit(TypedDict, total=False):
     geometry: Annotated[str, one_of(GEOMETRY_MODES)]
     friction_terms: Count
     stribeck_nats: float
+    """Of versions of earlier releases, as `friction_terms`."""
+    drive: Annotated[str, Meta(pattern=r"^[a-z, ]{0,60}$")]
+    drive_nats: float
     search_objective: float
     search_starts: Count
     search_hops: Count

@@ -47,7 +47,7 @@ class ArmKernel(LinearKernel):
         kinds = np.concatenate([np.tile(KINDS, arm.n_joints), np.full(arm.n_joints, SCALES - 1)])
         self._kinds = kinds
         self._unit = arm.unit
-        self.others = MixtureKernel(arm.alternatives, arm.order) if arm.alternatives else None
+        self.others = MixtureKernel(arm, arm.alternatives) if arm.alternatives else None
         mixed = None if self.others is None else self.others.prior_weights()
         others = np.zeros(0) if mixed is None else mixed
         self._rest = np.concatenate([arm.widths, np.ones(len(others))])

@@ -12,7 +12,7 @@ from lipcore.data.samples import Array
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import GeometryMode, Prior
+from lipcore.vocabulary import DriveKind, GeometryMode, Prior
 
 KINDS = (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)
 """Index of the scale of each of a body's ten parameters: mass, first moment or inertia."""
@@ -29,7 +29,7 @@ class Alternative:
     rotor: Array
     """Rotor inertias, (n,) kg·m², in the order of the data's joints."""
     friction: Array
-    """Coefficients of the friction kernel's features, (n, f), in the order of the data's joints."""
+    """Coefficients of the drive's terms, (n, f), in the order of the data's joints."""
     probability: float
     """Probability of this arm, from the evidence."""
 
@@ -56,8 +56,8 @@ class Arm:
     """Step from the geometry to its prior mean, (g,) rad and m."""
     widths: Array
     """Prior standard deviations of the geometry, (g,) rad and m."""
-    stribeck: bool = False
-    """Whether friction has its fourth term."""
+    drive: tuple[DriveKind, ...] = ()
+    """Kinds of friction beyond viscous, Coulomb and offset (`lipcore.kernels.drive.terms`)."""
     alternatives: tuple[Alternative, ...] = field(default=())
     """The arm itself, then the other arms; empty if there is no other."""
 

@@ -8,8 +8,8 @@ from scipy.spatial.distance import cdist
 
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import Cross, PairKernel, Params, State, on_diagonal
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.local import local_cross
-from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.kernels.independent import per_joint, power, spread
 
 

@@ -5,32 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.kernels.arm_prior import Alternative
+from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.fast.arm import arm_differences
-from lipcore.kernels.fast.friction import linear_features
-from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED
 
 
 class MixtureKernel(LinearKernel):
     """tau = Σ c_k δ_k with δ_k = τ_k − τ_0, the torque of arm k minus that of the first arm.
 
-    τ_k = Y(θ_k) π_k + r_k ∘ ddq + P f_k, with `newton_euler.rigid_body_torque` and `friction_features`; compiled. With
+    τ_k = Y(θ_k) π_k + r_k ∘ ddq + P f_k, with `newton_euler.rigid_body_torque` and `drive_features`; compiled. With
     c one of the K others or none, by their probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ. The
     sum then has the mean and the variance of the mixture of arms. The features are Lᵀ δ. Their weights L⁻¹ c, (K,), are
     independent with variance one, or a larger one if a few arms represent many.
 
-    arms: the first arm and the others, K + 1; order: (n,), the data's joint at each place of the chain; variance: of
-    the weights. mixing: L, (K, K).
+    arm: linearised arm, with the drive's kinds and load; arms: the first arm and the others, K + 1; variance: of the
+    weights. mixing: L, (K, K).
     """
 
-    def __init__(self, arms: Sequence[Alternative], order: NDArray[np.int64], variance: float = 1.0) -> None:
-        self.n_joints, self.size, self._variance = len(order), len(arms) - 1, variance
-        self._order = order.astype(np.int64)
+    def __init__(self, arm: Arm, arms: Sequence[Alternative], variance: float = 1.0) -> None:
+        self.n_joints, self.size, self._variance = arm.n_joints, len(arms) - 1, variance
+        self._arm = arm
         shares = np.array([each.probability for each in arms[1:]])
         self.mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
         self._mean = np.linalg.solve(self.mixing, shares)
@@ -44,7 +42,7 @@ class MixtureKernel(LinearKernel):
 
     def regressor(self) -> Regressor:
         """Return the regressor that computes Φ for single queries."""
-        return MixtureRegressor(self._arms, self._order)
+        return MixtureRegressor(self._arms, self._arm)
 
     def variances(self, params: Params) -> Array:
         """Return the prior variances of the weights, (K,)."""
@@ -62,9 +60,10 @@ class MixtureKernel(LinearKernel):
 class MixtureRegressor(Regressor):
     """Features of `MixtureKernel` for single queries."""
 
-    def __init__(self, arms: tuple[Array, Array, Array, Array, Array], order: NDArray[np.int64]) -> None:
-        self.n_joints, self.size = len(order), len(arms[0])
-        self._arms, self._order = arms, order
+    def __init__(self, arms: tuple[Array, Array, Array, Array, Array], arm: Arm) -> None:
+        self.n_joints, self.size = arm.n_joints, len(arms[0])
+        self._arms, self._order = arms, arm.order.astype(np.int64)
+        self._drive = DriveKernel(arm.n_joints, arm.drive, arm).regressor()
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (K, n)."""
@@ -73,7 +72,5 @@ class MixtureRegressor(Regressor):
     def fill_many(self, motions: Array, out: Array, first: int) -> None:
         """Write Φᵀ of N queries; see `Regressor.fill_many`."""
         rows = np.empty((len(motions), self.size, self.n_joints))
-        linear = np.empty((len(motions), *self._arms[-1].shape[1:]))
-        linear_features(motions, SIGN_WIDTH, STRIBECK_SPEED, linear)
-        arm_differences(*self._arms, self._order, motions, linear, rows)
+        arm_differences(*self._arms, self._order, motions, self._drive.linear(motions), rows)
         out[:, first : first + self.size] = rows

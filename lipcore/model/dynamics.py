@@ -30,6 +30,8 @@ _TORQUES: dict[ComponentName, dict[str, float]] = {
     "inertial": {"accelerating": 1.0, "rest": -1.0},
 }
 """Components as sums of torques at standstill, moving without acceleration, and accelerating from standstill."""
+LOAD_STEPS = 4
+"""Steps of forward dynamics. Each reduces the remaining torque to a few percent: the share of the load in friction."""
 
 
 class UnavailableComponentError(ValueError):
@@ -97,8 +99,9 @@ def reference_posture(model: TorqueModel) -> Array:
 def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate:
     """Return the acceleration under torque tau (N, n) N·m, ddq = M(q)⁻¹ (tau − c − g − f), (N, n) rad/s².
 
-    motion.ddq is not read. The uncertainty is of first order: an error ε of the whole torque at (q, dq, ddq) changes
-    ddq by −M⁻¹ ε. This includes the error of M, and it is valid while the uncertainty of M is small compared with M.
+    motion.ddq is not read. LOAD_STEPS fixed-point steps solve for friction that grows with the load, which depends on
+    ddq. The uncertainty is of first order: an error ε of the whole torque at (q, dq, ddq) changes ddq by −M⁻¹ ε. This
+    includes the error of M, and it is valid while the uncertainty of M is small compared with M.
     Raise IndefiniteInertiaError if M is not positive definite.
     """
     posterior, zero = model.posterior, np.zeros_like(motion.q)
@@ -107,8 +110,10 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
     lowest = np.linalg.eigvalsh(inertia)[:, 0]
     if not (lowest > 0).all():
         raise IndefiniteInertiaError(int(np.argmin(lowest > 0)))
-    bias = posterior.mean(Motion(motion.q, motion.dq, zero))
-    ddq = np.asarray(np.linalg.solve(inertia, (tau - bias)[:, :, None])[:, :, 0], np.float64)
+    ddq = zero
+    for _ in range(LOAD_STEPS):
+        left = tau - posterior.mean(Motion(motion.q, motion.dq, ddq))
+        ddq = ddq + np.linalg.solve(inertia, left[:, :, None])[:, :, 0]
     covariance = posterior.predict(Motion(motion.q, motion.dq, ddq)).covariance
     half = np.linalg.solve(inertia, covariance)  # M⁻¹ Σ
     variance = np.linalg.solve(inertia, half.mT).diagonal(axis1=1, axis2=2)

@@ -12,7 +12,8 @@ from lipcore.data.samples import Array
 from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
-from lipcore.kernels.friction import FrictionKernel, friction_terms
+from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.terms import summary_rows
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.plausible import is_plausible, nearest_plausible
 from lipcore.posterior.compact import CompactPosterior
@@ -43,20 +44,23 @@ class WeightPosterior:
 
 @dataclass(frozen=True)
 class Friction:
-    """Friction coefficients of each joint, with their standard deviations, (n,) each.
-
-    viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N). stribeck: N·m (N), additional friction at low speed, None if
-    the model does not have it.
-    """
+    """Friction of each joint, with standard deviations, (n,) each. See `summary_rows` if it is not linear in speed."""
 
     viscous: Array
+    """N·m·s/rad (N·s/m)."""
     viscous_std: Array
     coulomb: Array
+    """N·m (N)."""
     coulomb_std: Array
     offset: Array
+    """N·m (N)."""
     offset_std: Array
     stribeck: Array | None = None
+    """Additional friction at low speed, N·m (N); None if the model does not have it."""
     stribeck_std: Array | None = None
+    load: Array | None = None
+    """Friction per torque that the bodies need; None if the model does not have it."""
+    load_std: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -103,13 +107,15 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
     Raise ValueError for an estimator without friction.
     """
     term = estimator.terms.get("friction")
-    if not isinstance(term, FrictionKernel):
+    if not isinstance(term, DriveKernel):
         raise ValueError(f"estimator {estimator.name!r} has no friction term")
-    weights = weight_posterior(posterior, term)
-    shape = (term.n_joints, len(term.terms))
-    mean, std = weights.mean.reshape(shape).T, weights.std.reshape(shape).T
-    named = dict(zip(term.terms, mean, strict=True))
-    named |= {f"{name}_std": value for name, value in zip(term.terms, std, strict=True)}
+    weights, n, f = weight_posterior(posterior, term), term.n_joints, len(term.terms)
+    mean, joints = weights.mean.reshape(n, f), np.arange(n)
+    covariance = weights.covariance.reshape(n, f, n, f)[joints, :, joints]  # (n, f, f)
+    named = {}
+    for name, row in summary_rows(term.kinds).items():
+        named[name] = mean @ row
+        named[f"{name}_std"] = np.sqrt(np.maximum(np.einsum("f,nfg,g->n", row, covariance, row), 0.0))
     return Friction(**named)
 
 
@@ -168,7 +174,8 @@ def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Seque
     out: dict[str, Any] = {
         "friction": {
             name: {"mean": getattr(friction, name).tolist(), "std": getattr(friction, f"{name}_std").tolist()}
-            for name in friction_terms(friction.stribeck is not None)
+            for name in ("viscous", "coulomb", "offset", "stribeck", "load")
+            if getattr(friction, name) is not None
         }
     }
     if "rigid_body" in estimator.terms:

@@ -23,7 +23,7 @@ from lipcore.data.samples import Array
 from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.payload import PayloadKernel
@@ -164,7 +164,7 @@ class Carrier:
     def alternative(self, mean: Array, geometry: Geometry, payload: Array, probability: float) -> Alternative:
         """Return the arm of these variables, (M,), and a geometry, with a payload, (10,)."""
         arm, n, friction = self.term.arm, self.model.n_joints, self.model.estimator.terms["friction"]
-        assert isinstance(friction, FrictionKernel)
+        assert isinstance(friction, DriveKernel)
         weights, rows = self.weights(mean), self.model.posterior.basis.rows(friction)
         bodies = weights[: PARAMETERS * n].reshape(n, PARAMETERS)[arm.order]
         bodies[-1] += payload
@@ -329,11 +329,7 @@ class LinearisedCarrier:
     def _others(self) -> MixtureKernel | None:
         arm = self.carrier.term.arm
         others = self.load.others
-        return (
-            MixtureKernel(others, arm.order, _variance_factor([each.probability for each in others]))
-            if others
-            else None
-        )
+        return MixtureKernel(arm, others, _variance_factor([each.probability for each in others])) if others else None
 
     @cached_property
     def _payload(self) -> PayloadKernel:

@@ -59,7 +59,7 @@ def arm_of_sibling(base: TorqueModel) -> Arm:
 def arm_as_expected(arm: Arm) -> Arm:
     """Return the prior arm of a transferred arm, for another training of the same unit."""
     geometry = arm.geometry.moved(arm.expected) if arm.steps else arm.geometry
-    return replace(arm, geometry=geometry, expected=np.zeros(arm.steps), stribeck=False, alternatives=())
+    return replace(arm, geometry=geometry, expected=np.zeros(arm.steps), drive=(), alternatives=())
 
 
 def _sizes(squares: Array, n: int) -> Array:

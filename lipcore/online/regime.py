@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.drift import Drift
 from lipcore.posterior.linalg import mirror
@@ -56,7 +56,7 @@ class Walk:
         if not 0 < time_s < math.inf:
             raise ValueError(f"friction_walk_s is {time_s!r}, expected a positive number of seconds, or None")
         basis = base.posterior.basis
-        term = next((each for each in basis.linear if isinstance(each, FrictionKernel)), None)
+        term = next((each for each in basis.linear if isinstance(each, DriveKernel)), None)
         if term is None:
             raise ValueError(f"estimator {base.estimator.name!r} has no friction term")
         places = np.arange(len(basis))[basis.rows(term)]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.fast.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, answer_one, pack
-from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.posterior.misfit import Misfit
 
@@ -92,7 +92,7 @@ class Evaluator:
             regressor = kernel.regressor()
             last = first + regressor.size
             self._fills.append((first, last, regressor.fill))
-            self._fills_many.append((first, regressor.fill_many, isinstance(kernel, FrictionKernel | PayloadKernel)))
+            self._fills_many.append((first, regressor.fill_many, isinstance(kernel, DriveKernel | PayloadKernel)))
             if isinstance(kernel, PayloadKernel):
                 self._payload = slice(first, last)
             first = last

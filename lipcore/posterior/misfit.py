@@ -13,8 +13,8 @@ from lipcore.data.motion import Motion
 from lipcore.data.repetition import measure_distinct_share
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import ACCELERATED
-from lipcore.kernels.friction import SIGN_WIDTH
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,14 @@ class Misfit:
     def with_friction(self, coulomb: Array) -> Misfit:
         """Return this misfit with a variance at rest of at least `rest_share` × `coulomb`², (n,) N·m.
 
-        This also applies to joints that never moved.
+        This also applies to joints that never moved. A raised variance decays faster, so that it is unchanged at the
+        speed `slow`, but not below SIGN_WIDTH.
         """
-        return replace(self, rest=np.maximum(self.rest, OPTIONS.rest_share * coulomb**2))
+        rest = np.maximum(self.rest, OPTIONS.rest_share * coulomb**2)
+        least = np.finfo(float).tiny
+        raised = np.log(rest.clip(least)) - np.log(self.rest.clip(least))
+        slow = np.maximum(self.slow / np.sqrt(1.0 + raised), np.minimum(SIGN_WIDTH, self.slow))
+        return replace(self, rest=rest, slow=slow)
 
     def with_rest(self, other: Misfit) -> Misfit:
         """Return this misfit, with `rest` and `slow` of another misfit for joints with a larger `rest` there."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.friction import friction_features
+from lipcore.kernels.drive.terms import drive_features
 
 PREFERENCE = 10.0
 """Preference for outputs of samples that are already chosen: one is chosen if its residual is at least a tenth of the
@@ -35,7 +35,7 @@ def spread_out(motion: Motion, count: int) -> Indices:
             np.sin(motion.q),
             angle,
             motion.dq / spread[1].clip(1e-6),
-            0.5 * friction_features(motion.dq)[1],
+            0.5 * drive_features(motion.dq)[1],
             motion.ddq / spread[2].clip(1e-6),
         ],
         axis=1,

@@ -17,6 +17,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
+from lipcore.kernels.drive.terms import drive_terms
 from lipcore.kernels.fast import compile as compiling
 from lipcore.kernels.fast.compile import source_stamp, use_cache
 from lipcore.model.functionals import kinetic_energy
@@ -51,7 +52,7 @@ def test_first_training_compiles_nothing_more(name: str) -> None:
     energies = [term for kind, term in model.estimator.terms.items() if kind not in ("friction", "local")]
     kinetic_energy(model.posterior, energies, Motion.from_arrays(q[:2], dq[:2], ddq[:2]))
     if model.arm is not None:
-        friction = np.zeros((3, 4 if model.arm.stribeck else 3))
+        friction = np.zeros((3, len(drive_terms(model.arm.drive))))
         other = Alternative(model.arm.geometry, model.arm.parameters, np.zeros(3), friction, 0.5)
         ArmKernel(replace(model.arm, alternatives=(other, other))).features(Motion.from_arrays(q, dq, ddq))
     assert compiled_signatures() <= compiled

@@ -23,7 +23,7 @@ from scipy.linalg import solve_triangular
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.kernels.friction import SIGN_WIDTH
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.model.payload import LinearisedCarrier
 from lipcore.online.batch import Rows
 from lipcore.online.payload.bodies import ANY_PAYLOAD, CONTACT_SCALES, UNIT_BODY, evidence, most_likely, typical_torque

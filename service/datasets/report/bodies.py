@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import arm_of_robot
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.arm import arm_torques
-from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.robots.urdf import RigidBody
 from service.datasets.report.fit import FIT
 from service.datasets.report.signals import Limits

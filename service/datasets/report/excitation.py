@@ -23,7 +23,7 @@ from lipcore.data.samples import Array
 from lipcore.extras import MissingExtraError
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
+from lipcore.kernels.drive.terms import BASE_TERMS, SIGN_WIDTH
 from lipcore.robots.urdf import PARAMETERS, RigidBody
 from service.contract.datasets import JointExcitation, Verdict, Weight, WholeExcitation
 from service.datasets.report import texts
@@ -96,7 +96,7 @@ def judge_friction(friction: Sequence[Estimate], speed: float, torque: float, on
     sizes = (float(speed), 1.0, 1.0)
     out = {
         kind: _weight(*each, size, float(torque), kind != "offset")
-        for kind, each, size in zip(FRICTION_TERMS, friction, sizes, strict=True)
+        for kind, each, size in zip(BASE_TERMS, friction, sizes, strict=True)
     }
     if one_way:
         for kind in ("coulomb", "offset"):
@@ -202,7 +202,7 @@ REFERENCE = ReferenceOptions()
 
 @dataclass(frozen=True)
 class RigidExcitation:
-    """Excitation of rigid bodies. friction: each joint's coefficients in the order FRICTION_TERMS."""
+    """Excitation of rigid bodies. friction: each joint's coefficients in the order BASE_TERMS."""
 
     whole: WholeExcitation
     friction: list[list[Estimate]]
@@ -248,7 +248,7 @@ def judge_rigid_bodies(
     reference = _reference(kernel, limits)
     rows = np.linspace(0, len(motion[0]) - 1, min(len(motion[0]), REFERENCE.max_equations // n)).astype(np.int64)
     q, dq, ddq, tau = (each[rows] for each in (*motion, tau))
-    gram, projected = np.zeros((size, size)), np.zeros(size + len(FRICTION_TERMS) * n)
+    gram, projected = np.zeros((size, size)), np.zeros(size + len(BASE_TERMS) * n)
     information = np.zeros((len(projected), len(projected)))
     loudness = np.maximum(noise, 1e-9 * max(float(noise.max()), 1e-9))
     for first, block in _regressors(kernel, q, dq, ddq):
@@ -289,10 +289,10 @@ def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:
 def _friction(dq: Array) -> Array:
     """Return friction's features as equations, by row and then by joint: (R n, 3 n)."""
     rows, n = dq.shape
-    out = np.zeros((rows, n, n, len(FRICTION_TERMS)))
+    out = np.zeros((rows, n, n, len(BASE_TERMS)))
     joints = np.arange(n)
     out[:, joints, joints] = np.stack([dq, np.tanh(dq / SIGN_WIDTH), np.ones_like(dq)], axis=2)
-    return out.reshape(rows * n, len(FRICTION_TERMS) * n)
+    return out.reshape(rows * n, len(BASE_TERMS) * n)
 
 
 def _friction_weights(information: Array, projected: Array, back: Array) -> list[list[Estimate]]:
@@ -307,7 +307,7 @@ def _friction_weights(information: Array, projected: Array, back: Array) -> list
     std = (np.sqrt(np.diag(inverse)) / scale)[count:].tolist()
     mean = (inverse @ (turn.T @ projected / scale) / scale)[count:].tolist()
     estimates: list[Estimate] = list(zip(mean, std, strict=True))
-    return [estimates[first : first + len(FRICTION_TERMS)] for first in range(0, len(estimates), len(FRICTION_TERMS))]
+    return [estimates[first : first + len(BASE_TERMS)] for first in range(0, len(estimates), len(BASE_TERMS))]
 
 
 def _condition(gram: Array) -> float | None:

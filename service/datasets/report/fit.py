@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.kernels.friction import SIGN_WIDTH
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from service.datasets.report.signals import Rows
 
 OWN_FEATURES = ("dq", "sign dq", "ddq", "cos q", "sin q")

@@ -10,7 +10,7 @@ import numpy as np
 from lipcore import profiles
 from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Array
-from lipcore.kernels.friction import SIGN_WIDTH
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.contract import datasets as schema

@@ -21,7 +21,7 @@ from lipcore.files.entries import Parameters
 from lipcore.files.manifest import read_manifest_bytes
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.kernels.friction import friction_features
+from lipcore.kernels.drive.terms import drive_features
 from lipcore.model.parameters import inertial_parameters, report
 from lipcore.online.learner import OnlineModel
 from lipcore.posterior.compression import build_linear
@@ -153,7 +153,7 @@ def test_alternative_arms_have_the_moments_of_their_mixture(
     assert found is not None
     queries = random_motions(3, 4)
     query = Motion.from_arrays(*queries.transpose(1, 0, 2))
-    terms = friction_features(query.dq).transpose(1, 2, 0)
+    terms = drive_features(query.dq).transpose(1, 2, 0)
     torques = []
     for each in found.alternatives:
         model_of, flat = as_robot(each.geometry, random_bodies(3, 0)).model, each.parameters.reshape(-1)

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.arms import random_arm
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save, train
-from lipcore.arm import learning
+from lipcore.arm import drive
 from lipcore.data.motion import Motion
 from lipcore.estimators.catalogue import make_estimator
 from lipcore.files.arm import arm_tensors, read_arm
@@ -188,23 +188,23 @@ def stribeck_model() -> TorqueModel:
 
 @pytest.mark.slow
 def test_stribeck_friction_is_learnt_if_present(stribeck_model: TorqueModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert stribeck_model.fit["friction_terms"] == 4
-    assert float(stribeck_model.fit["stribeck_nats"]) > 10
+    assert stribeck_model.fit["drive"] == "stribeck"
+    assert float(stribeck_model.fit["drive_nats"]) > 10
     friction = friction_coefficients(stribeck_model.posterior, stribeck_model.estimator)
     assert friction.stribeck is not None
     assert (np.abs(friction.stribeck - 0.5) < 3 * friction.stribeck_std).all()
     assert (friction.stribeck_std < 0.1).all()
-    monkeypatch.setattr(learning, "OPTIONS", replace(learning.OPTIONS, min_stribeck_nats=np.inf))
+    monkeypatch.setattr(drive, "OPTIONS", replace(drive.OPTIONS, kinds=()))
     without, unseen = train_slow_arm(0.5), simulate_slow_motion(2, 0.5)
-    assert without.fit["friction_terms"] == 3
+    assert not without.fit["drive"]
     assert nmse_per_joint(stribeck_model, unseen).mean() < 0.8 * nmse_per_joint(without, unseen).mean()
 
 
 @pytest.mark.slow
 def test_stribeck_friction_is_not_learnt_if_absent() -> None:
     smooth = train_slow_arm(0.0)
-    assert smooth.fit["friction_terms"] == 3
-    assert float(smooth.fit["stribeck_nats"]) < 2
+    assert not smooth.fit["drive"]
+    assert smooth.fit["drive_nats"] == 0
     assert friction_coefficients(smooth.posterior, smooth.estimator).stribeck is None
 
 
@@ -215,7 +215,7 @@ def test_alternative_arms_have_stribeck_friction(stribeck_model: TorqueModel) ->
     each = [Alternative(*given, rng.random(3), rng.random((3, 4)), share) for share in (0.7, 0.3)]
     both = replace(known, alternatives=tuple(each))
     again = read_arm(arm_tensors(both), SLOW_ROBOT.joint_types, both.mode)
-    assert again.stribeck
+    assert again.drive == ("stribeck",)
     np.testing.assert_array_equal(again.alternatives[1].friction, each[1].friction)
     kernel = ArmKernel(again)
     dq = np.array([[0.05, -0.05, 0.5]])
@@ -227,14 +227,25 @@ def test_alternative_arms_have_stribeck_friction(stribeck_model: TorqueModel) ->
     np.testing.assert_allclose(differ, 0.3 * fading * each[1].friction[:, 3], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("values", [[0.5], [], [float("nan")]])
-def test_invalid_stribeck_flag_is_rejected(stribeck_model: TorqueModel, values: list[float]) -> None:
+@pytest.mark.parametrize("name", ["stribeck", "drive"])
+@pytest.mark.parametrize("values", [[0.5], [], [float("nan")], [1.0, 0.0]])
+def test_invalid_drive_is_rejected(stribeck_model: TorqueModel, name: str, values: list[float]) -> None:
     known = stribeck_model.arm
     assert known is not None
-    tensors = arm_tensors(known) | {"arm/stribeck": np.array(values)}
-    with pytest.raises(ValueError, match="'arm/stribeck' is"):
+    tensors = arm_tensors(known) | {f"arm/{name}": np.array(values)}
+    with pytest.raises(ValueError, match=f"'arm/{name}' is"):
         read_arm(tensors, SLOW_ROBOT.joint_types, known.mode)
-    assert not read_arm(tensors | {"arm/stribeck": np.zeros(1)}, SLOW_ROBOT.joint_types, known.mode).stribeck
+
+
+@pytest.mark.parametrize(("flag", "kinds"), [(0.0, ()), (1.0, ("stribeck",))])
+def test_arm_of_earlier_release_keeps_its_friction(
+    stribeck_model: TorqueModel, flag: float, kinds: tuple[str, ...]
+) -> None:
+    known = stribeck_model.arm
+    assert known is not None
+    tensors = {name: value for name, value in arm_tensors(known).items() if name != "arm/drive"}
+    tensors["arm/stribeck"] = np.array([flag])
+    assert read_arm(tensors, SLOW_ROBOT.joint_types, known.mode).drive == kinds
 
 
 def test_stribeck_friction_is_learnt_online(stribeck_model: TorqueModel) -> None:

@@ -22,11 +22,13 @@ from lipcore.estimators.task import Task
 from lipcore.export.c_weights import UnsupportedEstimatorError
 from lipcore.export.c_writer import HEADER, SOURCE, ModelOrigin, c_files
 from lipcore.kernels.base import PairKernel
+from lipcore.kernels.drive.terms import drive_terms
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.posterior.compression import build_linear
 from lipcore.posterior.misfit import Misfit
 from lipcore.training.fit import fit_estimator
+from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 from tests import ROOT
 from tests.choosing import few, slow
 from tests.clients.cpp.building import sanitizers
@@ -157,14 +159,15 @@ def train_with_alternatives() -> TorqueModel:
     return with_alternatives(train_arm("RPR", 51), record_motion(robot, 1, 100), 2)
 
 
-def train_with_stribeck() -> TorqueModel:
-    """Train an arm with the fourth friction term."""
+def train_with_drive(*kinds: DriveKind) -> TorqueModel:
+    """Train an arm with these kinds of friction."""
     _, _, robot = arm("RRR", 50)
     model, samples = train_arm("RRR", 50), record_motion(robot, 1, 100)
     posterior = model.posterior
-    estimator = make_estimator("rigid-body", model.joint_types, arm=replace(model.arm, stribeck=True))
+    estimator = make_estimator("rigid-body", model.joint_types, arm=replace(model.arm, drive=kinds))
     widths = posterior.params["friction.log_std"]
-    params = {**posterior.params, "friction.log_std": np.concatenate([widths, widths[:, 1:2]], axis=1)}
+    more = np.repeat(widths[:, 1:2], len(drive_terms(kinds)) - 3, axis=1)
+    params = {**posterior.params, "friction.log_std": np.concatenate([widths, more], axis=1)}
     variance = np.broadcast_to(posterior.noise_variance, samples.tau.shape)
     made = build_linear(estimator.kernel, params, samples, variance, 0.01, 1.0, posterior.misfit)
     return replace(model, estimator=estimator, posterior=made.posterior)
@@ -177,7 +180,8 @@ MODELS = {
     "alternatives": train_with_alternatives,
     "fixed, from its tip": lambda: reversed_pendulum_model("fixed", OPTIONS),
     "calibrated, from its tip": lambda: reversed_pendulum_model("calibrate", OPTIONS),
-    "friction of slow joints": train_with_stribeck,
+    "friction of slow joints": lambda: train_with_drive("stribeck"),
+    "friction of all kinds": lambda: train_with_drive(*DRIVE_KINDS),
     "misfit": lambda: with_misfit(train_arm("RRR", 50)),
     "energies": lambda: with_misfit(train_with_energies("RRR", 50)),
     "local": lambda: train_with_correction("RPR", 51),
@@ -205,7 +209,11 @@ def test_compiled_numbers_match_the_model(name: str, tmp_path: Path) -> None:
 
 @needs_compiler
 @pytest.mark.parametrize(
-    "name", ["panda", *map(slow, ("prismatic", "alternatives", "fixed, from its tip", "energies", "local"))]
+    "name",
+    [
+        "panda",
+        *map(slow, ("prismatic", "alternatives", "fixed, from its tip", "energies", "local", "friction of all kinds")),
+    ],
 )
 @pytest.mark.parametrize("body", [BODY, Body(0.7, np.array([0.1, 0.2, -0.3]))], ids=["body", "point"])
 def test_compiled_payload_matches_a_declared_payload(name: str, body: Body, tmp_path: Path) -> None:

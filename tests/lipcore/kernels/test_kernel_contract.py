@@ -17,8 +17,9 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.base import LinearKernel, PairKernel, State, SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.terms import drive_features
 from lipcore.kernels.fast.lanes import LANES
-from lipcore.kernels.friction import FrictionKernel, friction_features
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel
@@ -27,6 +28,7 @@ from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.newton_euler import rigid_body_torque
 from lipcore.kernels.payload import PayloadKernel
+from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 from tests.lipcore.arms import random_bodies, random_geometry
 from tests.lipcore.oracles import central_difference
 
@@ -81,14 +83,19 @@ def arm_features(arm: Arm, motion: Motion) -> Array:
     return np.concatenate([bodies, rotors, derivatives_by_geometry(arm, motion)], axis=2)
 
 
-def mixture_features(kernel: MixtureKernel, arms: Sequence[Alternative], order: np.ndarray, motion: Motion) -> Array:
+def drive_terms_of(arm: Arm, kinds: Sequence[DriveKind], motion: Motion) -> Array:
+    """Return the terms of friction with the torque of an arm's bodies as the load, (f, N, n)."""
+    return drive_features(motion.dq, kinds, np.abs(bodies_torque(arm.geometry, arm.order, arm.parameters, motion)))
+
+
+def mixture_features(kernel: MixtureKernel, arm: Arm, motion: Motion) -> Array:
     """Return the features Lᵀ δ of the other arms."""
-    friction = friction_features(motion.dq, stribeck=True)
+    friction = drive_terms_of(arm, arm.drive, motion)
     torques = [
-        bodies_torque(arm.geometry, order, arm.parameters, motion)
-        + arm.rotor * motion.ddq
-        + np.einsum("fki,if->ki", friction, arm.friction)
-        for arm in arms
+        bodies_torque(each.geometry, arm.order, each.parameters, motion)
+        + each.rotor * motion.ddq
+        + np.einsum("fki,if->ki", friction, each.friction)
+        for each in arm.alternatives
     ]
     return np.stack([each - torques[0] for each in torques[1:]], axis=2) @ kernel.mixing
 
@@ -104,7 +111,7 @@ def random_arm(joint_types: Sequence[str], others: int = 0) -> Arm:
             geometry.moved(0.1 * k * rng.standard_normal(geometry.size)),
             random_bodies(n, k),
             0.1 * rng.random(n),
-            rng.random((n, 4)),
+            rng.random((n, 6)),
             float(shares[k]),
         )
         for k in range(others + 1)
@@ -112,7 +119,14 @@ def random_arm(joint_types: Sequence[str], others: int = 0) -> Arm:
     bodies = random_bodies(n, 5)
     order = np.roll(np.arange(n), 1)
     return Arm(
-        geometry, order, "learn", bodies, bodies, *units, stribeck=True, alternatives=alternatives if others else ()
+        geometry,
+        order,
+        "learn",
+        bodies,
+        bodies,
+        *units,
+        drive=("stribeck", "load"),
+        alternatives=alternatives if others else (),
     )
 
 
@@ -123,8 +137,8 @@ def arm_case(joint_types: Sequence[str]) -> Case:
 
 def mixture_case(joint_types: Sequence[str]) -> Case:
     arm = random_arm(joint_types, others=2)
-    kernel = MixtureKernel(arm.alternatives, arm.order)
-    return Case(kernel, [partial(mixture_features, kernel, arm.alternatives, arm.order)])
+    kernel = MixtureKernel(arm, arm.alternatives)
+    return Case(kernel, [partial(mixture_features, kernel, arm)])
 
 
 def arm_with_alternatives_case(joint_types: Sequence[str]) -> Case:
@@ -144,9 +158,14 @@ def payload_case(joint_types: Sequence[str]) -> Case:
     return Case(PayloadKernel(arm, np.arange(1.0, 11.0)), [lambda motion: bodies(motion)[..., last]])
 
 
-def friction_case(joint_types: Sequence[str], stribeck: bool = False) -> Case:
-    kernel = FrictionKernel(len(joint_types), stribeck)
-    return Case(kernel, [kernel.features])
+def friction_case(joint_types: Sequence[str], kinds: Sequence[DriveKind] = ()) -> Case:
+    arm, n = random_arm(joint_types), len(joint_types)
+
+    def features(motion: Motion) -> Array:
+        terms = drive_terms_of(arm, kinds, motion)
+        return np.einsum("fki,ij->kijf", terms, np.eye(n)).reshape(len(motion), n, -1)
+
+    return Case(DriveKernel(n, kinds, arm if "load" in kinds else None), [features])
 
 
 def sum_case(joint_types: Sequence[str]) -> Case:
@@ -164,7 +183,9 @@ CASES: dict[str, Callable[[Sequence[str]], Case]] = {
     "lse": lambda joint_types: Case(LagrangianSEKernel(joint_types)),
     "local": lambda joint_types: Case(LocalKernel(len(joint_types))),
     "friction": friction_case,
-    "stribeck friction": partial(friction_case, stribeck=True),
+    "friction of slow joints": partial(friction_case, kinds=("stribeck",)),
+    "friction that is not linear in speed": partial(friction_case, kinds=("speed", "sides")),
+    "friction of all kinds": partial(friction_case, kinds=DRIVE_KINDS),
     "arm": arm_case,
     "arm with alternatives": arm_with_alternatives_case,
     "mixture of arms": mixture_case,

@@ -13,7 +13,7 @@ from torch.func import jacrev
 from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import make_estimator
-from lipcore.kernels.friction import SIGN_WIDTH
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.model import dynamics
 from lipcore.model.torque_model import training_range
 from lipcore.posterior.basis import Basis

@@ -9,7 +9,7 @@ import pytest
 
 from lipcore import FitOptions, Samples, TorqueModel, TorquePrediction, load, save, train
 from lipcore.data.motion import Motion
-from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.model.torque_model import training_torque
@@ -82,7 +82,7 @@ def condition(model: TorqueModel, motion: Motion, moving: Motion) -> tuple[np.nd
         variance = term.variance(posterior.params, motion)
         prior += np.diagonal(variance, axis1=1, axis2=2).reshape(-1)
     for kernel in posterior.basis.linear:
-        moves = isinstance(kernel, FrictionKernel | PayloadKernel)
+        moves = isinstance(kernel, DriveKernel | PayloadKernel)
         features = kernel.features(moving if moves else motion).reshape(-1, len(kernel.variances(posterior.params)))
         covariance = (features * kernel.variances(posterior.params)).T
         weights = kernel.prior_weights()

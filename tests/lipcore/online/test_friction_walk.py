@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore import FitOptions, TorqueModel
-from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.online import regime, transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
@@ -40,7 +40,7 @@ def with_friction_walk(base: TorqueModel, time_s: float) -> OnlineModel:
 def friction_places(base: TorqueModel) -> np.ndarray:
     """Return the places of the friction weights."""
     basis = base.posterior.basis
-    term = next(each for each in basis.linear if isinstance(each, FrictionKernel))
+    term = next(each for each in basis.linear if isinstance(each, DriveKernel))
     return np.arange(len(basis))[basis.rows(term)]
 
 

@@ -12,10 +12,11 @@ from lipcore.data.motion import Array, Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
-from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.posterior.evaluator import QUERIES, Evaluator
 from lipcore.robots.library import load_robot
 from lipcore.robots.urdf import RigidBody
+from lipcore.vocabulary import DRIVE_KINDS
 from tests.lipcore.kernels.test_baseline_kernels import BASELINES, random_case
 from tests.lipcore.oracles import random_problem
 
@@ -105,7 +106,7 @@ def case(
 
 
 def friction(n: int) -> tuple[LinearKernel, ...]:
-    return (FrictionKernel(n),)
+    return (DriveKernel(n),)
 
 
 def around_robot(name: str, kernel: str | None = None, order: Sequence[int] | None = None, **options: object) -> Case:
@@ -113,6 +114,12 @@ def around_robot(name: str, kernel: str | None = None, order: Sequence[int] | No
     types = load_robot(name).joint_types
     joint_types = tuple(types[i] for i in order or range(len(types)))
     return case(joint_types, kernel, (rigid_body(name, order, **options), *friction(len(types))))
+
+
+def rigid_body_with_drive(name: str) -> tuple[LinearKernel, ...]:
+    """Return the rigid bodies of a robot and friction of all kinds."""
+    bodies = rigid_body(name)
+    return bodies, DriveKernel(bodies.n_joints, DRIVE_KINDS, bodies.arm)
 
 
 PANDA = ("revolute",) * 7
@@ -126,8 +133,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "rigid-body": lambda: around_robot("panda"),
     "rigid-body alone, from zero": lambda: case(PANDA, None, (rigid_body("panda", prior="zero", gravity=False),)),
     "rigid-body with friction of slow joints": lambda: case(
-        PANDA, None, (rigid_body("panda"), FrictionKernel(7, stribeck=True))
+        PANDA, None, (rigid_body("panda"), DriveKernel(7, ("stribeck",)))
     ),
+    "rigid-body with friction of all kinds": lambda: case(PANDA, None, rigid_body_with_drive("panda")),
     "rigid-body and chain": lambda: around_robot("panda", "chain"),
     "rigid-body with geometry": lambda: around_robot("panda", mode="calibrate"),
     "unbounded joints in another order": lambda: around_robot("kinova", "chain", (3, 0, 5, 1, 4, 2)),
@@ -200,7 +208,7 @@ def test_negative_variance_gives_zero_std() -> None:
 
 def test_threads_get_identical_and_own_predictions() -> None:
     threads, rounds = 4, 30
-    both = case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7)), queries=threads)
+    both = case(PANDA, "chain", (rigid_body("panda"), DriveKernel(7)), queries=threads)
     evaluator, motions = both.evaluator(), both.query.arrays()
     tau, std, covariance, _ = evaluator.many(*arrays_of(both.query), covariance=True)
     start = Barrier(threads)

@@ -56,6 +56,14 @@ def test_residuals_of_any_size_are_accepted() -> None:
         assert np.isfinite([noise, rest]).all()
 
 
+def test_raised_variance_at_rest_is_unchanged_at_its_speed() -> None:
+    given = replace(Misfit.none(3), rest=np.array([0.0, 0.01, 4.0]), slow=np.array([0.02, 0.2, 0.2]))
+    raised = given.with_friction(np.full(3, 2.0))
+    np.testing.assert_allclose(raised.rest, [2.0, 2.0, 4.0])
+    np.testing.assert_allclose(raised.slow[[0, 2]], given.slow[[0, 2]])  # not below the width of the sign
+    np.testing.assert_allclose(raised.at_rest(given.slow)[1], given.at_rest(given.slow)[1])
+
+
 @pytest.mark.parametrize("seconds", [0.0, 0.5])
 def test_lasting_residuals_are_not_white_noise(seconds: float) -> None:
     """At 50 Hz, white noise is new in every row; low-passed noise lasts."""

@@ -21,6 +21,7 @@ FRICTION = {
     "coulomb": "Coulomb N·m",
     "offset": "offset N·m",
     "stribeck": "at low speed N·m",
+    "load": "share of the load",
 }
 Columns = dict[str, list[str]]
 
@@ -63,7 +64,8 @@ class Arm(Plain):
     deviation: Array
     """(n,) RMS difference between the torque of these bodies and that of the estimate, N·m (prismatic: N)."""
     friction: Mapping[str, tuple[Array, Array]]
-    """Means and standard deviations, (n,) each, of `viscous`, `coulomb`, `offset` and, if estimated, `stribeck`."""
+    """Means and standard deviations, (n,) each, of `viscous`, `coulomb` and `offset`; `stribeck` and `load` if
+    estimated."""
     undetermined: tuple[tuple[str, ...], ...]
     """Per joint, parameters that are unidentifiable from torque."""
 

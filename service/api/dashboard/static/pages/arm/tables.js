@@ -19,6 +19,7 @@ export function jointTable({ joint_names: names, parameters: { geometry } }) {
     { label: "Position, m", numeric: true, cell: (place) => vector(zero[place].origin) },
     { label: "± turn, °", numeric: true, cell: (place) => stds(geometry.joints[place].turn_std, DEGREES) },
     { label: "± shift, mm", numeric: true, cell: (place) => stds(geometry.joints[place].shift_std, 1000) },
+    ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: (joint) => pair(friction.load, joint) }] : []),
     { label: "Unidentifiable", cell: (place) => geometry.joints[place].undetermined.join(", ") || "–" },
   ];
   return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Joint axes from base to tip, in the base frame, with all positions at zero; ±: one standard deviation in two directions across the axis" });
@@ -40,6 +41,7 @@ export function massTable({ joint_names: names, joint_types: types, parameters }
     { label: "Viscous, N·m·s", numeric: true, cell: (joint) => pair(friction.viscous, joint) },
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },
     ...(friction.stribeck ? [{ label: "Stribeck, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
+    ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: (joint) => pair(friction.load, joint) }] : []),
     { label: "Unidentifiable", cell: (joint) => (inertia.bodies[joint].undetermined ?? []).map((each) => each.replace("_", " ")).join(", ") || "–" },
   ];
   return h("div", { class: "dense" }, table(columns, geometry.order, { caption: `Bodies in their joint frames, and friction; ±: one standard deviation${sliding}` }));

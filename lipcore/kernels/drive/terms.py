@@ -1,0 +1,97 @@
+"""The terms of a joint's friction torque, one coefficient each.
+
+With the velocity v, its smoothed sign s = tanh(v / w), and the torque τ that the bodies need at this joint:
+
+    viscous   v
+    coulomb   s
+    offset    1
+    stribeck  s exp(−(v / 0.1)²)                                             friction falls with speed
+    speed     tanh(v / 0.1), tanh(v / 0.4), tanh(v / 1.5), v |v|             it is not linear in speed
+    sides     |s|, |v|                                                       it differs between the directions
+    load      |τ| s, |τ| v                                                   it grows with the torque carried
+
+Every drive has the first three. The others are kinds that a recording has to support (`lipcore.arm.drive`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import cast
+
+import numpy as np
+
+from lipcore.data.motion import Array
+from lipcore.vocabulary import DRIVE_KINDS, DriveKind
+
+SIGN_WIDTH = 0.02
+"""Velocity w over which the Coulomb sign changes, rad/s (m/s): the smoothed sign avoids a jump at standstill."""
+STRIBECK_SPEED = 0.1
+"""Speed at which the additional friction of slow joints has decayed to exp(−1), rad/s (m/s)."""
+SHAPE_SPEEDS = (0.1, 0.4, 1.5)
+"""Speeds of the shapes tanh(v / speed), rad/s (m/s)."""
+SUMMARY_SPEEDS = (0.1, 1.0)
+"""Speeds between which a report states friction as a line, rad/s (m/s)."""
+BASE_TERMS = ("viscous", "coulomb", "offset")
+KIND_TERMS: dict[DriveKind, tuple[str, ...]] = {
+    "stribeck": ("stribeck",),
+    "speed": ("speed_slow", "speed_medium", "speed_fast", "speed_square"),
+    "sides": ("side", "side_viscous"),
+    "load": ("load", "load_viscous"),
+}
+
+
+def check_kinds(kinds: Iterable[str]) -> tuple[DriveKind, ...]:
+    """Return kinds in their usual order, each once; raise ValueError naming the first one that is unknown."""
+    given = list(kinds)
+    for kind in given:
+        if kind not in DRIVE_KINDS:
+            raise ValueError(f"drive kind is {kind!r}, expected one of {', '.join(DRIVE_KINDS)}")
+    return cast("tuple[DriveKind, ...]", tuple(kind for kind in DRIVE_KINDS if kind in given))
+
+
+def drive_terms(kinds: Sequence[DriveKind] = ()) -> tuple[str, ...]:
+    """Return the names of a joint's terms."""
+    return (*BASE_TERMS, *(term for kind in kinds for term in KIND_TERMS[kind]))
+
+
+def drive_features(dq: Array, kinds: Sequence[DriveKind] = (), load: Array | None = None) -> Array:
+    """Return the terms of N velocities, (f, N, n).
+
+    dq: (N, n) rad/s (m/s); load: (N, n) N·m (N), the absolute torque that the bodies need; for the kind `load`.
+    """
+    sign, speed = np.tanh(dq / SIGN_WIDTH), np.abs(dq)
+    parts = [dq, sign, np.ones_like(dq)]
+    if "stribeck" in kinds:
+        parts.append(sign * np.exp(-((dq / STRIBECK_SPEED) ** 2)))
+    if "speed" in kinds:
+        parts += [*(np.tanh(dq / each) for each in SHAPE_SPEEDS), dq * speed]
+    if "sides" in kinds:
+        parts += [np.abs(sign), speed]
+    if "load" in kinds:
+        assert load is not None  # the caller computes it
+        parts += [load * sign, load * dq]
+    return np.stack(parts)
+
+
+def summary_rows(kinds: Sequence[DriveKind]) -> dict[str, Array]:
+    """Return the coefficients of what a report states in a joint's terms, (f,) each.
+
+    `viscous`, `coulomb`, `offset`, and `stribeck` and `load` if they are modelled. With `speed` or `sides`, several
+    terms are similar. `viscous` is then the slope of friction from SUMMARY_SPEEDS[0] to SUMMARY_SPEEDS[1], `coulomb`
+    the friction that this line has at standstill, and `offset` the mean of both directions at the lower speed.
+    """
+    terms = drive_terms(kinds)
+    rows = {name: np.array([float(term == name) for term in terms]) for name in (*BASE_TERMS, "stribeck", "load")}
+    rows = {name: row for name, row in rows.items() if row.any()}
+    if not {"speed", "sides"} & set(kinds):
+        return rows
+    low, high = SUMMARY_SPEEDS
+    counted = np.array([term not in ("stribeck", *KIND_TERMS["load"]) for term in terms])
+    speeds = np.array([[low], [high]])
+    ahead, back = (
+        drive_features(each, kinds, np.zeros_like(each))[:, :, 0] * counted[:, None] for each in (speeds, -speeds)
+    )
+    odd = 0.5 * (ahead - back)
+    viscous = (odd[:, 1] - odd[:, 0]) / (high - low)
+    offset = 0.5 * (ahead[:, 0] + back[:, 0])
+    return {**rows, "viscous": viscous, "coulomb": odd[:, 0] - low * viscous, "offset": offset}

@@ -1,0 +1,116 @@
+"""Terms of the drive for queries, see `kernels.drive.terms`, and ddq with them for the arms of a mixture.
+
+Common arguments:
+
+- kinds: (4,), one for each of `DRIVE_KINDS`: 1 if the drive has it, else 0;
+- memory: `Memory` of the arm's constants, gravity and parameters, with `drive_size` elements to work in; without the
+  kind `load`, only n elements;
+- order: (n,), the data's joint at each place of the chain.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lipcore.kernels.fast.arm_recursion import (
+    CONSTANTS,
+    PARAMETERS,
+    WORK,
+    Array,
+    Indices,
+    bodies,
+    kinematics,
+    torques,
+)
+from lipcore.kernels.fast.compile import brief, compiled, inlined
+from lipcore.kernels.fast.views import numbers
+
+STRIBECK, SPEED, SIDES, LOAD = range(4)
+"""Places of the kinds."""
+
+
+def drive_size(n: int) -> int:
+    """Return the number of elements that the kind `load` works in."""
+    return (n + 1) * WORK + n
+
+
+@inlined
+def _write_terms(
+    velocity: float, load: float, kinds: Indices, constants: Array, out: Array, row: int, column: int
+) -> None:
+    """Write a joint's terms into a column of `out`, from a row on.
+
+    constants: (5,), speeds of the sign, of `stribeck` and of the three shapes.
+    """
+    sign, speed = np.tanh(velocity / constants[0]), abs(velocity)
+    out[row, column] = velocity
+    out[row + 1, column] = sign
+    out[row + 2, column] = 1.0
+    row += 3
+    if kinds[STRIBECK]:
+        out[row, column] = sign * np.exp(-((velocity / constants[1]) ** 2))
+        row += 1
+    if kinds[SPEED]:
+        for k in range(3):
+            out[row + k, column] = np.tanh(velocity / constants[2 + k])
+        out[row + 3, column] = velocity * speed
+        row += 4
+    if kinds[SIDES]:
+        out[row, column] = abs(sign)
+        out[row + 1, column] = speed
+        row += 2
+    if kinds[LOAD]:
+        out[row, column] = load * sign
+        out[row + 1, column] = load * velocity
+
+
+@compiled
+def _write_load(memory: Array, order: Indices, kinds: Indices, motion: Array, load: Array) -> None:
+    """Write the absolute torque that the bodies need at each joint, (n,), if it is needed."""
+    if not kinds[LOAD]:
+        return
+    n = order.shape[0]
+    place = n * CONSTANTS
+    body = place + 3
+    at = body + n * PARAMETERS
+    work = numbers(memory, at, (n + 1, WORK))
+    kinematics(numbers(memory, 0, (n, CONSTANTS)), memory[place:body], motion, order, work)
+    bodies(numbers(memory, 0, (n, CONSTANTS)), numbers(memory, body, (n, PARAMETERS)), work)
+    torques(order, work, load)
+    for j in range(n):
+        load[j] = abs(load[j])
+
+
+@brief
+def drive_query(memory: Array, order: Indices, kinds: Indices, constants: Array, motion: Array, out: Array) -> None:
+    """Write joint j's terms into rows f j to f j + f − 1 of `out`, (f n, n), in column j. Other elements are zero."""
+    n = order.shape[0]
+    load = memory[memory.shape[0] - n :]
+    _write_load(memory, order, kinds, motion, load)
+    out[:] = 0.0
+    terms = out.shape[0] // n
+    for joint in range(n):
+        _write_terms(motion[1, joint], load[joint], kinds, constants, out, terms * joint, joint)
+
+
+@compiled
+def drive_queries(
+    memory: Array, order: Indices, kinds: Indices, constants: Array, motions: Array, out: Array, first: int, last: int
+) -> None:
+    """Write the terms of N queries, (N, 3, n), into rows `first` to `last` of each part of `out`, (N, …, n)."""
+    for k in range(motions.shape[0]):
+        drive_query(memory, order, kinds, constants, motions[k], out[k, first:last])
+
+
+@compiled
+def linear_features(
+    memory: Array, order: Indices, kinds: Indices, constants: Array, motions: Array, out: Array
+) -> None:
+    """Write ddq and the terms of each joint, (N, n, 1 + f). motions: (N, 3, n)."""
+    n = order.shape[0]
+    load = memory[memory.shape[0] - n :]
+    for k in range(motions.shape[0]):
+        _write_load(memory, order, kinds, motions[k], load)
+        for j in range(n):
+            out[k, j, 0] = motions[k, 2, j]
+            _write_terms(motions[k, 1, j], load[j], kinds, constants, out[k].T, 1, j)
