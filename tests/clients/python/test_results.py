@@ -187,14 +187,15 @@ def test_text_and_html_show_every_joint_and_unidentifiable_parameters(arm):
     assert arm.as_dict()["frames"]["mode"] == "learn"
 
 
-def test_stribeck_friction_is_shown_if_estimated(robot, arm):
+@pytest.mark.parametrize(("kind", "head"), [("stribeck", "at low speed N·m"), ("load", "share of the load")])
+def test_further_friction_is_shown_if_estimated(robot, arm, kind, head):
     parameters = parameters_of(robot)
-    parameters["friction"]["stribeck"] = {"mean": [float(k) for k in range(7)], "std": [0.01] * 7}
+    parameters["friction"][kind] = {"mean": [float(k) for k in range(7)], "std": [0.01] * 7}
     shown = read_arm(version(parameters))
-    np.testing.assert_allclose(shown.friction["stribeck"][0], range(6, -1, -1))
-    assert list(shown.tables()["friction"])[-1] == "at low speed N·m"
-    assert "stribeck" not in arm.friction
-    assert "low speed" not in str(arm)
+    np.testing.assert_allclose(shown.friction[kind][0], range(6, -1, -1))
+    assert list(shown.tables()["friction"])[-1] == head
+    assert kind not in arm.friction
+    assert head not in str(arm)
 
 
 def test_version_prints_warnings_and_arm(robot):
