@@ -12,8 +12,8 @@ The evidence alone trusts a recording in which joints move together too much; he
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,25 +71,29 @@ def choose_drive(problem: Problem, point: Point, rows: NDArray[np.int64], stop: 
     rows: of the recording, (N,), the problem's samples in order of time; stop: called at every step. Raise LinAlgError
     if an evidence cannot be computed.
     """
-    before, gain = rescale(problem, point), 0.0
+    blocks = np.empty(len(rows), np.int64)
+    blocks[np.argsort(rows, kind="stable")] = np.arange(len(rows)) * OPTIONS.blocks // len(rows)
+    best, gain = rescale(problem, point), 0.0
+    errors = held_out_errors(best.problem, best.point, blocks)
     samples = float(problem.counts.mean(axis=1).sum())
     open_kinds = [kind for kind in OPTIONS.kinds if samples >= OPTIONS.min_samples or len(KIND_TERMS[kind]) == 1]
     while open_kinds and not stop():
         trials: list[tuple[float, DriveKind, ScaleFit]] = []
         for kind in open_kinds:
-            wider = with_kind(before.problem, before.point, kind)
+            wider = with_kind(best.problem, best.point, kind)
             trial = rescale(wider, wider.at(point.geometry, point.sigma))
-            trials.append((before.value - trial.value, kind, trial))
-        trials.sort(key=lambda each: -each[0])
-        accepted = next(
-            (each for each in trials if each[0] >= _min_nats(each[1]) and _is_supported(before, each[2], rows)), None
-        )
-        if accepted is None:
+            trials.append((best.value - trial.value, kind, trial))
+        for nats, kind, trial in sorted(trials, key=lambda each: -each[0]):
+            if nats < _min_nats(kind) or _falls_with_load(trial.problem, trial.point):
+                continue
+            wider_errors = held_out_errors(trial.problem, trial.point, blocks)
+            if _is_better(errors, wider_errors):
+                best, errors, gain = trial, wider_errors, gain + nats
+                open_kinds.remove(kind)
+                break
+        else:
             break
-        gain += accepted[0]
-        before = accepted[2]
-        open_kinds.remove(accepted[1])
-    return DriveChoice(before.problem, before.point, gain)
+    return DriveChoice(best.problem, best.point, gain)
 
 
 def _min_nats(kind: DriveKind) -> float:
@@ -97,42 +101,27 @@ def _min_nats(kind: DriveKind) -> float:
     return OPTIONS.min_nats if len(KIND_TERMS[kind]) == 1 else OPTIONS.min_nats_of_several
 
 
-def _is_supported(before: ScaleFit, after: ScaleFit, rows: NDArray[np.int64]) -> bool:
-    """Return whether a wider problem predicts held-out blocks better, with plausible coefficients of the load."""
-    if _falls_with_load(after.problem, after.point):
-        return False
-    blocks = np.empty(len(rows), np.int64)
-    blocks[np.argsort(rows, kind="stable")] = np.arange(len(rows)) * OPTIONS.blocks // len(rows)
-    errors = [held_out_errors(each.problem, each.point, blocks) for each in (before, after)]
-    gains = np.log(errors[0] / errors[1]).mean(axis=1)
+def _is_better(before: Array, after: Array) -> bool:
+    """Return whether held-out errors fall beyond their scatter over the blocks, (B, n) each."""
+    gains = np.log(before / after).mean(axis=1)
     return bool(gains.mean() > OPTIONS.min_deviations * gains.std(ddof=1) / np.sqrt(len(gains)))
 
 
-def held_out_errors(problem: Problem, point: Point, blocks: Sequence[int] | NDArray[np.int64]) -> Array:
+def held_out_errors(problem: Problem, point: Point, blocks: NDArray[np.int64]) -> Array:
     """Return the mean squared error of each joint in B blocks predicted from the others, (B, n) (N·m)².
 
-    The torque is linear in all unknowns around the point. blocks: (N,), each sample's block.
+    The torque is linear in all unknowns around the point, so one step from it fits the others. blocks: (N,), each
+    sample's block.
     """
-    blocks = np.asarray(blocks)
-    weight = np.sqrt(problem.counts) / point.sigma
-    both = np.concatenate([point.features, problem.shapes(point)], axis=2)
-    target = problem.tau - both[:, :, : len(problem.scale)] @ (problem.centre / problem.scale)
-    prior, size = np.ones(both.shape[2]), both.shape[2]
-    steps = np.zeros(size)
-    if problem.expected is not None:
-        prior[len(problem.scale) :] = problem.expected.widths**-2.0
-        steps[len(problem.scale) :] = prior[len(problem.scale) :] * problem.expected.step(point.geometry)
-    flat, right = both * weight[:, :, None], target * weight
-    names = np.unique(blocks)
-    parts = [(flat[blocks == each].reshape(-1, size), right[blocks == each].reshape(-1)) for each in names]
-    grams = [(rows.T @ rows, rows.T @ values) for rows, values in parts]
-    total, total_right = sum(gram for gram, _ in grams) + np.diag(prior), sum(each for _, each in grams) + steps
-    out = np.empty((len(names), problem.n_joints))
-    for at, (gram, each) in enumerate(grams):
-        mean = cho_solve((root_of(total - gram), True), total_right - each, check_finite=False)
-        mine = blocks == names[at]
-        out[at] = np.square(target[mine] - both[mine] @ mean).mean(axis=0)
-    return out
+    out = []
+    for held in (blocks == block for block in np.unique(blocks)):
+        of_others, of_held = (replace(point, features=point.features[rows]) for rows in (~held, held))
+        hessian, gradient, _ = problem.rows(~held).normal(of_others)
+        step = cho_solve((root_of(hessian), True), gradient, check_finite=False)
+        block = problem.rows(held)
+        both = np.concatenate([of_held.features, block.shapes(of_held)], axis=2)
+        out.append(np.square(block.residual(of_held) - both @ step).mean(axis=0))
+    return np.array(out)
 
 
 def _falls_with_load(problem: Problem, point: Point) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.base import SumKernel, TorqueKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.model.functionals import (
     EnergyKernel,
     Estimate,
@@ -104,14 +105,14 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
     includes the error of M, and it is valid while the uncertainty of M is small compared with M.
     Raise IndefiniteInertiaError if M is not positive definite.
     """
-    posterior, zero = model.posterior, np.zeros_like(motion.q)
+    posterior = model.posterior
     inertia = inertia_matrix(posterior, SumKernel(*_dynamics_terms(model.estimator)), motion.q)
     inertia = 0.5 * (inertia + inertia.mT)
     lowest = np.linalg.eigvalsh(inertia)[:, 0]
     if not (lowest > 0).all():
         raise IndefiniteInertiaError(int(np.argmin(lowest > 0)))
-    ddq = zero
-    for _ in range(LOAD_STEPS):
+    friction, ddq = model.estimator.terms.get("friction"), np.zeros_like(motion.q)
+    for _ in range(LOAD_STEPS if isinstance(friction, DriveKernel) and "load" in friction.kinds else 1):
         left = tau - posterior.mean(Motion(motion.q, motion.dq, ddq))
         ddq = ddq + np.linalg.solve(inertia, left[:, :, None])[:, :, 0]
     covariance = posterior.predict(Motion(motion.q, motion.dq, ddq)).covariance

@@ -67,7 +67,7 @@ class DriveRegressor(Regressor):
         self.n_joints = n = kernel.n_joints
         self._terms = len(kernel.terms)
         self.size = self._terms * n
-        arm = kernel.arm
+        arm = kernel.arm if "load" in kernel.kinds else None
         self._order = np.arange(n) if arm is None else arm.order.astype(np.int64)
         self._kinds = np.array([int(kind in kernel.kinds) for kind in DRIVE_KINDS])
         self._constants = np.array([SIGN_WIDTH, STRIBECK_SPEED, *SHAPE_SPEEDS])

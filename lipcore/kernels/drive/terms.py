@@ -74,7 +74,7 @@ def drive_features(dq: Array, kinds: Sequence[DriveKind] = (), load: Array | Non
 
 
 def summary_rows(kinds: Sequence[DriveKind]) -> dict[str, Array]:
-    """Return the coefficients of what a report states in a joint's terms, (f,) each.
+    """Return the row, (f,), that turns a joint's coefficients into each number of a report.
 
     `viscous`, `coulomb`, `offset`, and `stribeck` and `load` if they are modelled. With `speed` or `sides`, several
     terms are similar. `viscous` is then the slope of friction from SUMMARY_SPEEDS[0] to SUMMARY_SPEEDS[1], `coulomb`
