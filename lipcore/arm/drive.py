@@ -24,6 +24,7 @@ from lipcore.arm.problem import Point, Problem, root_of
 from lipcore.arm.scales import ScaleFit, rescale
 from lipcore.data.samples import Array
 from lipcore.kernels.drive.terms import KIND_TERMS
+from lipcore.kernels.fast.play import POSITIONS
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 
 
@@ -76,7 +77,12 @@ def choose_drive(problem: Problem, point: Point, rows: NDArray[np.int64], stop: 
     best, gain = rescale(problem, point), 0.0
     errors = held_out_errors(best.problem, best.point, blocks)
     samples = float(problem.counts.mean(axis=1).sum())
-    open_kinds = [kind for kind in OPTIONS.kinds if samples >= OPTIONS.min_samples or len(KIND_TERMS[kind]) == 1]
+    remembers = problem.motions.shape[1] > POSITIONS
+    open_kinds = [
+        kind
+        for kind in OPTIONS.kinds
+        if (samples >= OPTIONS.min_samples or len(KIND_TERMS[kind]) == 1) and (remembers or kind != "play")
+    ]
     while open_kinds and not stop():
         trials: list[tuple[float, DriveKind, ScaleFit]] = []
         for kind in open_kinds:
@@ -126,7 +132,7 @@ def held_out_errors(problem: Problem, point: Point, blocks: NDArray[np.int64]) -
 
 def _falls_with_load(problem: Problem, point: Point) -> bool:
     """Return whether the friction of a joint falls with the load, beyond doubt."""
-    terms = list(problem.drive.names)
+    terms = list(problem.drive.terms)
     if "load" not in terms:
         return False
     places = problem.bodies + terms.index("load") + len(terms) * np.arange(problem.n_joints)

@@ -17,6 +17,7 @@ from lipcore.arm.problem import WIDTHS, Point, Problem, root_of
 from lipcore.arm.right_angles import Candidate, Layout
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
+from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
 from lipcore.estimators import noise
@@ -25,6 +26,7 @@ from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Alternative, Arm, chain
 from lipcore.kernels.drive.terms import summary_rows
 from lipcore.kernels.fast.arm import PARAMETERS
+from lipcore.kernels.fast.play import POSITIONS
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.selection import spread_out
@@ -166,14 +168,19 @@ class _Counting:
         """
         misfit, noise = self.misfit(problem, point)
         misfit = misfit if at_rest else replace(misfit, rest=np.zeros_like(misfit.rest))
-        variance = misfit.of_row(noise, problem.motions[:, 1], self.shared)
+        variance = misfit.of_row(noise, Motion.of(problem.motions), self.shared)
         return replace(problem, counts=noise / variance)
 
     def misfit(self, problem: Problem, point: Point, least: Array | float = 0.0) -> tuple[Misfit, Array]:
         """Return `estimate_misfit` of a point's residuals on contiguous samples, base to tip."""
         recorded = with_samples(problem, self.contiguous, self.order)
-        residual, moved = recorded.tau - recorded.mean(point), recorded.motions[:, 1:].swapaxes(0, 1)
-        return estimate_misfit(residual, recorded.tau, moved, self.contiguous.episodes(), least)
+        residual, moved = recorded.tau - recorded.mean(point), recorded.motions[:, 1:POSITIONS].swapaxes(0, 1)
+        misfit, noise = estimate_misfit(residual, recorded.tau, moved, self.contiguous.episodes(), least)
+        if problem.drive.elements is not None:
+            widths = problem.drive.elements.widths
+            friction = problem.weights(point)[problem.bodies :].reshape(problem.n_joints, -1)
+            misfit = replace(misfit, elements=np.stack([np.abs(friction[:, -len(widths) :]).T, widths]))
+        return misfit, noise
 
 
 def _search(
@@ -267,6 +274,7 @@ def _arm(found: Sequence[Candidate], order: NDArray[np.int64], mode: GeometryMod
         np.zeros(0) if expected is None else expected.step(best.geometry),
         np.zeros(0) if expected is None else expected.widths,
         problem.drive.kinds,
+        None if problem.drive.elements is None else problem.drive.elements.acceleration[place],
     )
     differing = [each for each in found[1:] if _differs(problem, best, each.point)]
     if not differing:

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.arm.problem import Drive, GeometryPrior, Point, Problem
+from lipcore.arm.problem import GeometryPrior, Point, Problem
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators import noise
 from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_from_torque
-from lipcore.kernels.drive.terms import BASE_TERMS, check_kinds, drive_terms
+from lipcore.kernels.drive.kernel import Bodies, Drive, Elements
+from lipcore.kernels.drive.play import element_widths
+from lipcore.kernels.drive.terms import BASE_TERMS, check_kinds
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.vocabulary import DriveKind, GeometryMode, JointType
@@ -64,6 +66,7 @@ def make_problem(
     and noise, `samples` if None.
     """
     n, every = samples.n_joints, samples if every is None else every
+    drive = Drive(n)
     motions, tau = _in_chain(samples, order)
     usual = np.sqrt(np.mean(every.tau**2, axis=0))[order]
     floor, start = noise.floor(every)[order], noise.start(every)[order]
@@ -82,13 +85,14 @@ def make_problem(
         motions,
         tau,
         np.ones(tau.shape),
-        Drive().features(motions),
+        drive.features(motions),
         np.concatenate([centre, np.zeros(len(friction))]),
         unit,
         unit,
         start,
         floor,
         _expected(types, gravity, around),
+        drive,
     )
 
 
@@ -100,9 +104,8 @@ def with_samples(problem: Problem, samples: Samples, order: NDArray[np.int64]) -
 
 
 def _in_chain(samples: Samples, order: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return motions (N, 3, n) and torques (N, n) from base to tip."""
-    parts = [in_chain(part, order) for part in (samples.q, samples.dq, samples.ddq)]
-    return np.ascontiguousarray(np.stack(parts, axis=1)), in_chain(samples.tau, order)
+    """Return motions, as of `Motion.arrays`, and torques (N, n) from base to tip."""
+    return np.ascontiguousarray(samples.motion().arrays()[:, :, order]), in_chain(samples.tau, order)
 
 
 def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -> GeometryPrior | None:
@@ -125,10 +128,13 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind) -> Problem:
     The prior std of a new term is that of the Coulomb term, for the term's largest size in the samples.
     """
     n, first, before = problem.n_joints, problem.bodies, problem.drive
-    kinds = check_kinds((*before.kinds, kind))
-    drive = Drive(kinds, (point.geometry, problem.parameters(point)) if "load" in kinds else None)
-    terms, known = drive_terms(kinds), drive_terms(before.kinds)
-    largest = np.abs(drive.by_joint(problem.motions)).max(axis=1)  # (f, n)
+    kinds, elements = check_kinds((*before.kinds, kind)), before.elements
+    if kind == "play":
+        usual = np.sqrt(np.mean(problem.motions[:, 2] ** 2, axis=0)).clip(1e-3)
+        elements = Elements(element_widths(point.geometry.joint_types), usual)
+    drive = Drive(n, kinds, _carried(problem, point), elements)
+    terms, known = drive.terms, before.terms
+    largest = np.abs(drive.by_joint(problem.motions)).max(axis=0)  # (n, f)
     unit, scale = np.empty((2, n, len(terms)))
     for values, old in ((unit, problem.unit), (scale, problem.scale)):
         of_joint = old[first:].reshape(n, -1)
@@ -136,7 +142,7 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind) -> Problem:
             if term in known:
                 values[:, place] = of_joint[:, known.index(term)]
             else:
-                values[:, place] = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[place], 1e-3)
+                values[:, place] = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[:, place], 1e-3)
     return replace(
         problem,
         friction=drive.features(problem.motions),
@@ -147,9 +153,13 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind) -> Problem:
     )
 
 
+def _carried(problem: Problem, point: Point) -> Bodies:
+    return Bodies(point.geometry, problem.parameters(point), np.arange(problem.n_joints))
+
+
 def with_load(problem: Problem, point: Point) -> Problem:
     """Return the same problem with the load of a point's bodies."""
     if "load" not in problem.drive.kinds:
         return problem
-    drive = Drive(problem.drive.kinds, (point.geometry, problem.parameters(point)))
+    drive = replace(problem.drive, bodies=_carried(problem, point))
     return replace(problem, drive=drive, friction=drive.features(problem.motions))

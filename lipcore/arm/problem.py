@@ -17,10 +17,9 @@ from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from lipcore.data.motion import Indices
 from lipcore.data.samples import Array
-from lipcore.kernels.drive.terms import drive_features, drive_terms
-from lipcore.kernels.fast.arm import PARAMETERS, arm_masses, arm_shapes, arm_torques
+from lipcore.kernels.drive.kernel import Drive
+from lipcore.kernels.fast.arm import PARAMETERS, arm_masses, arm_shapes
 from lipcore.kernels.geometry import Geometry
-from lipcore.vocabulary import DriveKind
 
 
 @dataclass(frozen=True)
@@ -85,43 +84,11 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Drive:
-    """Friction of the joints, base to tip."""
-
-    kinds: tuple[DriveKind, ...] = ()
-    """Kinds beyond viscous, Coulomb and offset."""
-    carried: tuple[Geometry, Array] | None = None
-    """Bodies that are the load: their geometry and inertial parameters, (n, 10); None without the kind `load`."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of a joint's terms, (f,)."""
-        return drive_terms(self.kinds)
-
-    def by_joint(self, motions: Array) -> Array:
-        """Return each joint's terms, (f, N, n). motions: (N, 3, n)."""
-        load = None
-        if self.carried is not None:
-            (geometry, bodies), load = self.carried, np.empty((len(motions), motions.shape[2]))
-            arm_torques(geometry.constants, geometry.gravity, bodies, np.arange(motions.shape[2]), motions, load)
-            load = np.abs(load)
-        return drive_features(np.ascontiguousarray(motions[:, 1]), self.kinds, load)
-
-    def features(self, motions: Array) -> Array:
-        """Return the features P of N motions, joint by joint, (N, n, f n) (section 5 of docs/method.md)."""
-        terms = self.by_joint(motions)
-        (f, size, n), joints = terms.shape, np.arange(terms.shape[2])
-        out = np.zeros((size, n, n, f))
-        out[:, joints, joints] = terms.transpose(1, 2, 0)
-        return out.reshape(size, n, -1)
-
-
-@dataclass(frozen=True)
 class Problem:
     """Samples, with the prior of the arm that is learnt from them."""
 
     motions: Array
-    """q, dq and ddq from base to tip, (N, 3, n)."""
+    """Motion from base to tip, as of `Motion.arrays`, (N, 3, n) or (N, 3 + 2 K, n)."""
     tau: Array
     """Torques, (N, n) N·m."""
     counts: Array
@@ -140,8 +107,8 @@ class Problem:
     """Min noise, (n,) N·m."""
     expected: GeometryPrior | None
     """Prior of the geometry, None if it is fixed."""
-    drive: Drive = Drive()
-    """Terms of friction."""
+    drive: Drive
+    """Terms of friction, base to tip."""
     scale_width: float = WIDTHS.scale
     """Prior standard deviation of the parts of the logarithms of s, except those of friction."""
 
@@ -163,12 +130,13 @@ class Problem:
     def recombined(self, count: int) -> Problem:
         """Return a problem of at most `count` recombined motions, without torque.
 
-        Position, velocity and acceleration of a motion are those of three samples. It is in the range of the samples,
-        but new.
+        Position, velocity and acceleration of a motion are those of three samples, deflections those of the velocity.
+        It is in the range of the samples, but new.
         """
         rng, size = np.random.default_rng(0), min(count, len(self.tau))
         rows = rng.integers(len(self.tau), size=(3, size))
-        motions = np.stack([self.motions[rows[part], part] for part in range(3)], axis=1)
+        motions = self.motions[rows[1]]
+        motions[:, 0], motions[:, 2] = self.motions[rows[0], 0], self.motions[rows[2], 2]
         nothing = np.zeros((size, self.n_joints))
         return replace(
             self, motions=motions, tau=nothing, counts=np.ones_like(nothing), friction=self.drive.features(motions)

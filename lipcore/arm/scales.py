@@ -75,7 +75,7 @@ def rescale(problem: Problem, point: Point) -> ScaleFit:
     evidence = _Evidence.around(problem, point)
     parts, masses = _parts(n, k), BODY_KINDS + n + 1
     frictions = k - problem.bodies
-    least = np.full(len(problem.drive.names), np.log(OPTIONS.min_kind_share))
+    least = np.full(len(problem.drive.terms), np.log(OPTIONS.min_kind_share))
     least[: len(BASE_TERMS)] = np.log(OPTIONS.min_friction_share)
     bounds = [(-OPTIONS.max_log_share, OPTIONS.max_log_share)] * masses
     bounds += [(float(each), 0.0) for each in np.tile(least, n)]

@@ -51,12 +51,15 @@ def motion_arrays(q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> tuple[Array, A
 class Motion:
     """N instants of motion of n joints, float64.
 
-    q, dq, ddq: (N, n) position, velocity, acceleration in rad, rad/s, rad/s² (prismatic: m, m/s, m/s²).
+    q, dq, ddq: (N, n) position, velocity, acceleration in rad, rad/s, rad/s² (prismatic: m, m/s, m/s²). deflections:
+    (N, 2 K, n), of the drive's K play elements: their expected values, then the half widths of the ranges that they lie
+    in (`lipcore.kernels.drive.play`); None if the motion before these instants is unknown.
     """
 
     q: Array
     dq: Array
     ddq: Array
+    deflections: Array | None = None
 
     @classmethod
     def from_arrays(cls, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Motion:
@@ -67,7 +70,9 @@ class Motion:
         return len(self.q)
 
     def __getitem__(self, rows: slice | Indices) -> Motion:
-        return Motion(self.q[rows], self.dq[rows], self.ddq[rows])
+        return Motion(
+            self.q[rows], self.dq[rows], self.ddq[rows], None if self.deflections is None else self.deflections[rows]
+        )
 
     @property
     def n_joints(self) -> int:
@@ -75,5 +80,15 @@ class Motion:
         return int(self.q.shape[1])
 
     def arrays(self) -> Array:
-        """Return q, dq and ddq as one C-contiguous array (N, 3, n) for compiled code."""
-        return np.stack([self.q, self.dq, self.ddq], axis=1)
+        """Return q, dq, ddq and the deflections, if known, as one C-contiguous array for compiled code.
+
+        It has the shape (N, 3, n) or (N, 3 + 2 K, n).
+        """
+        own = np.stack([self.q, self.dq, self.ddq], axis=1)
+        return own if self.deflections is None else np.concatenate([own, self.deflections], axis=1)
+
+    @classmethod
+    def of(cls, motions: Array) -> Motion:
+        """Return the motion that `arrays` returned."""
+        q, dq, ddq = motions[:, :3].swapaxes(0, 1)
+        return cls(q, dq, ddq, motions[:, 3:] if motions.shape[1] > 3 else None)

@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 class Samples:
     """N samples of n joints, SI units, joint order as in `joint_names`.
 
-    q, dq, ddq, tau: (N, n); t: (N,) seconds; episode: (N,) integers, constant over one contiguous recording.
+    q, dq, ddq, tau: (N, n); t: (N,) seconds; episode: (N,) integers, constant over one contiguous recording;
+    deflections: as in `Motion`, from the motion before each sample, or None.
 
     Example:
         >>> t, rest = np.linspace(0.0, 1.0, 5), np.zeros((5, 1))
@@ -34,6 +35,7 @@ class Samples:
     dq: Array
     ddq: Array
     tau: Array
+    deflections: Array | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.t), len(self.joint_names))
@@ -42,6 +44,8 @@ class Samples:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {shape}")
         if self.episode.shape != (shape[0],):
             raise ValueError(f"episode has shape {self.episode.shape}, expected {(shape[0],)}")
+        if self.deflections is not None and self.deflections.shape[::2] != shape:
+            raise ValueError(f"deflections have shape {self.deflections.shape}, expected {shape} around elements")
 
     def __len__(self) -> int:
         return len(self.t)
@@ -53,7 +57,8 @@ class Samples:
 
     def rows(self, index: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Samples:
         """Return the chosen rows. index: a slice, indices, or a mask (N,)."""
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "joint_names"})
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "joint_names"}
+        return replace(self, **{name: each[index] for name, each in arrays.items() if each is not None})
 
     def episodes(self) -> list[slice]:
         """Return the contiguous runs of equal `episode`, in order of rows."""
@@ -62,8 +67,8 @@ class Samples:
         return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
     def motion(self) -> Motion:
-        """Return position, velocity and acceleration, (N, n) each, copied; raise ValueError if one is not finite."""
-        return Motion.from_arrays(self.q, self.dq, self.ddq)
+        """Return the motion, with copies of q, dq and ddq; raise ValueError if one of their numbers is not finite."""
+        return replace(Motion.from_arrays(self.q, self.dq, self.ddq), deflections=self.deflections)
 
     @staticmethod
     def concatenate(parts: list[Samples]) -> Samples:
@@ -82,4 +87,6 @@ class Samples:
             episodes.append(numbered)
             used = int(numbered.max()) + 1
         stack = {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("t", "q", "dq", "ddq", "tau")}
-        return Samples(joint_names=names, episode=np.concatenate(episodes), **stack)
+        known = [part.deflections for part in parts if part.deflections is not None]
+        deflections = np.concatenate(known) if len(known) == len(parts) else None
+        return Samples(joint_names=names, episode=np.concatenate(episodes), deflections=deflections, **stack)

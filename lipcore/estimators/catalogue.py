@@ -18,7 +18,7 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
-from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.local import LocalKernel
@@ -84,15 +84,14 @@ def make_estimator(
     if name not in ESTIMATORS:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
     types = check_joint_types(joint_types)
-    drive = DriveKernel(len(types), () if arm is None else arm.drive, arm)
+    drive = DriveKernel(Drive(len(types)) if arm is None else arm.friction)
     terms = {**ESTIMATORS[name](types, tied), "friction": drive}
     if (name in ROBOT_ESTIMATORS) != (arm is not None):
         raise ValueError(f"estimator {name!r}: only {', '.join(ROBOT_ESTIMATORS)} need an arm, others must have none")
     if arm is None:
         return Estimator(name, terms)
-    of_arm = tuple(arm.geometry.joint_types[place] for place in arm.place)
-    if of_arm != types:
-        raise JointMismatchError(f"the arm has joints {of_arm}, the data have {types}")
+    if arm.joint_types != types:
+        raise JointMismatchError(f"the arm has joints {arm.joint_types}, the data have {types}")
     return Estimator(name, {"rigid_body": ArmKernel(arm), **terms})
 
 

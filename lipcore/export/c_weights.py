@@ -124,7 +124,7 @@ def group_parameters(learnt: LinearWeights) -> tuple[list[list[int]], Array]:
 def _in_weights(learnt: LinearWeights, axes: Array, expand: Array) -> Array:
     """Return T of all weights. expand: (n, 10, b), features of the bodies in their written frames."""
     arm, n, size = learnt.arm.arm, learnt.arm.n_joints, expand.shape[2]
-    rubbing = len(learnt.friction.terms)
+    rubbing = len(learnt.friction.drive.terms)
     rest = learnt.arm.size - (PARAMETERS + 1) * n
     out = np.zeros((len(learnt.mean), n * (1 + rubbing) + size + rest))
     first = n * (1 + rubbing)

@@ -110,7 +110,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
     return {
         "n": str(n),
         "friction": str(rubbing.shape[1]),
-        **{kind: str(int(kind in learnt.friction.kinds)) for kind in DRIVE_KINDS},
+        **{kind: str(int(kind in learnt.friction.drive.kinds)) for kind in DRIVE_KINDS},
         "bodies": str(sum(counts)),
         "steps": str(arm.steps),
         "others": str(others),

@@ -25,6 +25,7 @@ _TENSORS = {
         "order",
         "rotor",
         "drive",
+        "acceleration",
         "stribeck",
         *(f"other/{name}" for name in _ALTERNATIVE_TENSORS),
     )
@@ -46,6 +47,8 @@ def arm_tensors(arm: Arm) -> dict[str, Array]:
         parts["rotor"] = arm.rotor
     if arm.drive:
         parts["drive"] = np.array([float(kind in arm.drive) for kind in DRIVE_KINDS])
+    if arm.acceleration is not None:
+        parts["acceleration"] = arm.acceleration
     if each := arm.alternatives:
         parts |= {
             "other/rotation": np.stack([one.geometry.rotation for one in each]),
@@ -75,9 +78,17 @@ def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mod
     geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY_TENSORS))
     rotor = tensors.get(f"{PREFIX}rotor")  # rotors of zero inertia are not stored
     parts["rotor"] = np.zeros(len(types)) if rotor is None else rotor
-    drive = _drive(tensors)
+    drive, acceleration = _drive(tensors), tensors.get(f"{PREFIX}acceleration")
+    if (acceleration is None) == ("play" in drive) or (acceleration is not None and not _is_usual(acceleration, types)):
+        raise ValueError(
+            "tensor 'arm/acceleration' is wrong, expected one positive number a joint if friction has play"
+        )
     alternatives = _alternatives(tensors, geometry, len(drive_terms(drive)))
-    return Arm(geometry, order, mode, drive=drive, alternatives=alternatives, **parts)
+    return Arm(geometry, order, mode, drive=drive, acceleration=acceleration, alternatives=alternatives, **parts)
+
+
+def _is_usual(acceleration: Array, types: Sequence[JointType]) -> bool:
+    return acceleration.shape == (len(types),) and bool(np.isfinite(acceleration).all() and (acceleration > 0).all())
 
 
 def _drive(tensors: Mapping[str, Array]) -> tuple[DriveKind, ...]:

@@ -12,13 +12,17 @@ from lipcore.files import strict_json
 from lipcore.files.arm import is_arm_tensor
 from lipcore.files.manifest import TENSORS, Limits, ModelFormatError
 from lipcore.files.strict_json import quote
+from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.model.selection import Count
+from lipcore.posterior.misfit import Misfit
 
 MAX_HEADER_BYTES = 256 * 1024
 HEADER_LENGTH_BYTES = 8
 """Size of the header's length field."""
 OUTPUTS = "inducing/outputs"
 INDUCING = ("inducing/q", "inducing/dq", "inducing/ddq")
+MISFIT_ROWS = 5, 6, 6 + 2 * len(ELEMENTS)
+"""Rows of a misfit: of earlier releases, without and with play elements."""
 A, B, FLOOR, MISFIT = "statistics/a", "statistics/b", "floor", "misfit"
 PARAMS = "params/"
 TYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "I64": np.dtype("<i8")}
@@ -57,8 +61,10 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
     if FLOOR in tensors and bool((tensors[FLOOR] < 0).any()):
         raise _bad(f"tensor {FLOOR!r} has a number below zero, expected variances")
     if MISFIT in tensors:
-        rest, slow, lasting, speed, acceleration = tensors[MISFIT]
-        variances, motion = np.stack([rest, lasting]), np.stack([slow, speed, acceleration])
+        misfit = Misfit.unpacked(tensors[MISFIT])
+        torques, widths = misfit.elements
+        variances = np.concatenate([np.stack([misfit.rest, misfit.lasting, misfit.still]), torques])
+        motion = np.concatenate([np.stack([misfit.slow, misfit.speed, misfit.acceleration]), widths])
         if bool((variances < 0).any() or (motion <= 0).any()):
             raise _bad(f"tensor {MISFIT!r} has a number below zero, expected variances, speeds and accelerations")
     return tensors
@@ -145,6 +151,6 @@ def _check_sizes(entries: dict[str, Tensor], n: int, limits: Limits) -> None:
     if entries[A].shape != (b[0] * (b[0] + 1) // 2,):
         length = b[0] * (b[0] + 1) // 2
         raise _bad(f"{A} has shape {entries[A].shape}, expected M (M + 1) / 2 numbers, {length}, as {B} has {b[0]}")
-    for name, shape in ((FLOOR, (n,)), (MISFIT, (5, n))):
-        if name in entries and entries[name].shape != shape:
-            raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shape}")
+    for name, shapes in ((FLOOR, [(n,)]), (MISFIT, [(rows, n) for rows in MISFIT_ROWS])):
+        if name in entries and entries[name].shape not in shapes:
+            raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shapes[-1]}")

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
+from lipcore.kernels.drive.kernel import Bodies, Drive, Elements
+from lipcore.kernels.drive.play import element_widths
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import DriveKind, GeometryMode, Prior
+from lipcore.vocabulary import DriveKind, GeometryMode, JointType, Prior
 
 KINDS = (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)
 """Index of the scale of each of a body's ten parameters: mass, first moment or inertia."""
@@ -58,6 +61,8 @@ class Arm:
     """Prior standard deviations of the geometry, (g,) rad and m."""
     drive: tuple[DriveKind, ...] = ()
     """Kinds of friction beyond viscous, Coulomb and offset (`lipcore.kernels.drive.terms`)."""
+    acceleration: Array | None = None
+    """Usual acceleration of the joints, (n,) rad/s² (m/s²), in the order of the data, for the kind `play`."""
     alternatives: tuple[Alternative, ...] = field(default=())
     """The arm itself, then the other arms; empty if there is no other."""
 
@@ -98,6 +103,19 @@ class Arm:
     def place(self) -> NDArray[np.int64]:
         """Place in the chain of each joint of the data, (n,)."""
         return np.argsort(self.order)
+
+    @property
+    def joint_types(self) -> tuple[JointType, ...]:
+        """Types of the joints, (n,), in the order of the data."""
+        return tuple(self.geometry.joint_types[place] for place in self.place)
+
+    @cached_property
+    def friction(self) -> Drive:
+        """The drive, in the order of the data's joints."""
+        elements = None
+        if self.acceleration is not None:
+            elements = Elements(element_widths(self.joint_types), self.acceleration)
+        return Drive(self.n_joints, self.drive, Bodies(self.geometry, self.parameters, self.order), elements)
 
 
 def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", mode: GeometryMode = "fixed") -> Arm:

@@ -209,7 +209,7 @@ class _FormulaCross(Cross):
     def fill_many(self, motions: Array, out: Array) -> None:
         """Write the covariances of N queries; see `Cross.fill_many`."""
         anchors = (self._anchors.q, self._anchors.v, self._anchors.a)
-        for query, block in zip(motions[..., None], out, strict=True):
+        for query, block in zip(motions[:, :3, :, None], out, strict=True):
             rows = State(*(np.concatenate(pair, axis=1) for pair in zip(anchors, query, strict=True)))
             block[:] = self._blocks(self._params, rows, State(*query)).transpose(2, 0, 1)
             block[-1] = 0.5 * (block[-1] + block[-1].T)

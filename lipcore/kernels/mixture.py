@@ -10,14 +10,13 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
-from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.fast.arm import arm_differences
 
 
 class MixtureKernel(LinearKernel):
     """tau = Σ c_k δ_k with δ_k = τ_k − τ_0, the torque of arm k minus that of the first arm.
 
-    τ_k = Y(θ_k) π_k + r_k ∘ ddq + P f_k, with `newton_euler.rigid_body_torque` and `drive_features`; compiled. With
+    τ_k = Y(θ_k) π_k + r_k ∘ ddq + P f_k, with `newton_euler.rigid_body_torque` and the drive's features; compiled. With
     c one of the K others or none, by their probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ. The
     sum then has the mean and the variance of the mixture of arms. The features are Lᵀ δ. Their weights L⁻¹ c, (K,), are
     independent with variance one, or a larger one if a few arms represent many.
@@ -63,7 +62,7 @@ class MixtureRegressor(Regressor):
     def __init__(self, arms: tuple[Array, Array, Array, Array, Array], arm: Arm) -> None:
         self.n_joints, self.size = arm.n_joints, len(arms[0])
         self._arms, self._order = arms, arm.order.astype(np.int64)
-        self._drive = DriveKernel(arm.n_joints, arm.drive, arm).regressor()
+        self._drive = arm.friction.regressor
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (K, n)."""

@@ -112,7 +112,7 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
     if not (lowest > 0).all():
         raise IndefiniteInertiaError(int(np.argmin(lowest > 0)))
     friction, ddq = model.estimator.terms.get("friction"), np.zeros_like(motion.q)
-    for _ in range(LOAD_STEPS if isinstance(friction, DriveKernel) and "load" in friction.kinds else 1):
+    for _ in range(LOAD_STEPS if isinstance(friction, DriveKernel) and "load" in friction.drive.kinds else 1):
         left = tau - posterior.mean(Motion(motion.q, motion.dq, ddq))
         ddq = ddq + np.linalg.solve(inertia, left[:, :, None])[:, :, 0]
     covariance = posterior.predict(Motion(motion.q, motion.dq, ddq)).covariance

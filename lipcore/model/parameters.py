@@ -109,11 +109,11 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
     term = estimator.terms.get("friction")
     if not isinstance(term, DriveKernel):
         raise ValueError(f"estimator {estimator.name!r} has no friction term")
-    weights, n, f = weight_posterior(posterior, term), term.n_joints, len(term.terms)
+    weights, n, f = weight_posterior(posterior, term), term.n_joints, len(term.drive.terms)
     mean, joints = weights.mean.reshape(n, f), np.arange(n)
     covariance = weights.covariance.reshape(n, f, n, f)[joints, :, joints]  # (n, f, f)
     named = {}
-    for name, row in summary_rows(term.kinds).items():
+    for name, row in summary_rows(term.drive.kinds).items():
         named[name] = mean @ row
         named[f"{name}_std"] = np.sqrt(np.maximum(np.einsum("f,nfg,g->n", row, covariance, row), 0.0))
     return Friction(**named)

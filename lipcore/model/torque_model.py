@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.motion import Motion, motion_arrays
-from lipcore.data.samples import Array
+from lipcore.data.samples import Array, Samples
 from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
+from lipcore.kernels.drive.play import with_deflections
 from lipcore.model import external
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
@@ -178,14 +179,25 @@ class TorqueModel:
         """Factor on the half width of intervals, (n,), at least 1, from held-out blocks of the training."""
         return np.ones(self.n_joints) if self.conformal is None else np.array(self.conformal.scale)
 
-    def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, covariance: bool = False) -> TorquePrediction:
+    def predict(
+        self,
+        q: ArrayLike,
+        dq: ArrayLike,
+        ddq: ArrayLike,
+        covariance: bool = False,
+        deflections: Array | None = None,
+    ) -> TorquePrediction:
         """Return the torque with its uncertainty at N states, or at one.
+
+        Friction may depend on the motion before a state. Without `deflections` that motion is unknown, and the
+        uncertainty at low speed is larger.
 
         Args:
             q: Positions, (n,) or (N, n), rad (m).
             dq: Velocities, same shape, rad/s (m/s).
             ddq: Accelerations, same shape, rad/s² (m/s²).
             covariance: Whether to compute the covariance between the joints.
+            deflections: Deflections of the play elements, (N, 2 K, n); see `lipcore.kernels.drive.play`.
 
         Returns:
             Torques, standard deviations and, if requested, covariances; see `TorquePrediction`.
@@ -198,20 +210,36 @@ class TorqueModel:
         joints = query[0].shape[1]
         if joints != self.n_joints:
             raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
-        mean, std, between, share = self.evaluator.many(*query, covariance)
+        mean, std, between, share = self.evaluator.many(*query, covariance, deflections)
         tau, fallback = mean, None
         if share is not None:
             rows = share.any(axis=1)
             tau, fallback = mean.copy(), Fallback(share, mean)
-            tau[rows] = self.evaluator.fall_back(np.stack(query, axis=1)[rows], mean[rows], share[rows])
+            motions = Motion(*query, deflections)[np.flatnonzero(rows)].arrays()
+            tau[rows] = self.evaluator.fall_back(motions, mean[rows], share[rows])
         return TorquePrediction(tau, std, self.noise_std, self.scale, between, fallback)
+
+    def predict_along(self, samples: Samples, covariance: bool = False) -> TorquePrediction:
+        """Return the torque along recordings: rows are in order of time in each episode, and friction follows them.
+
+        Raise ValueError like `predict`.
+        """
+        known = samples.deflections
+        if known is None and self.remembers and samples.n_joints == self.n_joints:
+            known = with_deflections(samples, self.joint_types).deflections
+        return self.predict(samples.q, samples.dq, samples.ddq, covariance, known)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether friction depends on the motion before a state."""
+        return self.posterior.misfit.elements.size > 0
 
     def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
         """Return the torque at one instant, and its standard deviation if `std`, both (n,) N·m.
 
         It is meant for control loops.
 
-        motion: q, dq and ddq as a float64 array (3, n). Neither shape nor finiteness is checked. Values that are not
+        motion: q, dq and ddq, and deflections if known, float64 (3, n) or (3 + 2 K, n). Neither shape nor finiteness is checked. Values that are not
         finite give torques that are not finite.
         """
         tau, deviation, share = self.evaluator.one(motion, std)

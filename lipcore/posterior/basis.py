@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -50,7 +50,8 @@ class Basis:
         if term is not None:
             gram = term.symmetric_gram(params, inducing)
             roots.insert(0, cholesky(gram[np.ix_(outputs, outputs)]).lower)
-        return cls(term, linear, params, inducing, outputs, block_diagonal(roots))
+        # files store no deflections, on which only linear terms depend
+        return cls(term, linear, params, replace(inducing, deflections=None), outputs, block_diagonal(roots))
 
     def __len__(self) -> int:
         return len(self.root)

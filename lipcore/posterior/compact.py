@@ -124,7 +124,7 @@ class CompactPosterior(Posterior):
 
     def row_variance(self, motion: Motion) -> Array:
         """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)², within the reach of the basis."""
-        return self.misfit.of_row(self.noise_variance, motion.dq)
+        return self.misfit.of_row(self.noise_variance, motion)
 
     def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
         """Return the posterior mean and n×n covariance of the torques at each of N queries, or of one kernel term.

@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
 from lipcore.kernels.drive.kernel import DriveKernel
-from lipcore.kernels.fast.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, answer_one, pack
+from lipcore.kernels.drive.play import ELEMENTS
+from lipcore.kernels.drive.terms import SIGN_WIDTH
+from lipcore.kernels.fast.answer import COVARIANCE, MEAN, MISFIT_ROWS, ROWS, STD, WIDTH, answer, answer_one, pack
+from lipcore.kernels.fast.play import POSITIONS
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.posterior.misfit import Misfit
 
@@ -29,14 +32,24 @@ class _Scratch(threading.local):
 
     def __init__(self, queries: int, samples: int, anchors: int, linear: int, n: int) -> None:
         groups = -(-n // WIDTH)
-        self.motions = np.zeros((queries, 3, n))
+        self.motions = np.zeros((queries, POSITIONS, n))
+        self.deflected = np.zeros((queries, POSITIONS + 2 * len(ELEMENTS), n))
         self.blocks = np.zeros((queries, samples + 1, n, n))
         self.features = np.zeros((queries, linear, n))
         self.memory = np.zeros(groups * WIDTH * (queries * anchors + ROWS))
         self.std = np.zeros((queries, n))
         self.covariance = np.zeros((queries, n, n))
         self.share = np.zeros((queries, n))
-        self.of_one = self.motions, self.blocks, self.features, self.covariance, self.memory, self.std, self.share
+        self.of_one = (
+            self.motions,
+            self.deflected,
+            self.blocks,
+            self.features,
+            self.covariance,
+            self.memory,
+            self.std,
+            self.share,
+        )
 
 
 class Evaluator:
@@ -49,7 +62,7 @@ class Evaluator:
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), the chosen torques, as sample · n + joint. linear: the linear terms in the order
     of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,) (N·m)²;
-    misfit: (5, n), see `Misfit.packed`; None for no floor or misfit. usual: mean and variance of the torque in
+    misfit: see `Misfit.packed`; None for no floor or misfit. usual: mean and variance of the torque in
     training, (n,) each, if predictions may fall back.
 
     `one` and `many` return the mean of the posterior, which learning and external torque need. They also return the
@@ -100,10 +113,10 @@ class Evaluator:
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
-        nothing = Misfit.none(n).packed()
-        self._misfit = nothing if misfit is None else np.array(misfit, np.float64)
-        if self._misfit.shape != nothing.shape:
-            raise ValueError(f"misfit has shape {self._misfit.shape}, expected {nothing.shape}")
+        self._misfit = Misfit.none(n).packed() if misfit is None else np.array(misfit, np.float64)
+        rows = MISFIT_ROWS, MISFIT_ROWS + 2 * len(ELEMENTS)
+        if self._misfit.shape not in [(count, n) for count in rows]:
+            raise ValueError(f"misfit has shape {self._misfit.shape}, expected ({rows[0]} or {rows[1]}, {n})")
         self._falls_back = usual is not None
         self._usual_mean: Array = np.zeros(n) if usual is None else usual[0]
         self._usual: Array = np.full(n, np.inf) if usual is None else usual[1]
@@ -132,7 +145,9 @@ class Evaluator:
     def one(
         self, motion: Array, std: bool = True, covariance: Array | None = None
     ) -> tuple[Array, Array | None, Array | None]:
-        """Return the torque, (n,), at one query, (3, n) q, dq and ddq, and its standard deviation, (n,), if `std`.
+        """Return the torque, (n,), at one query, and its standard deviation, (n,), if `std`.
+
+        motion: q, dq and ddq, (3, n), then the deflections if they are known, see `Motion.arrays`.
 
         Third, return the share of the fallback, (n,), or None if it is zero for all joints. covariance: (1, n, n),
         receives the covariance between the joints if given, with std. Neither shape nor finiteness is checked. The
@@ -140,9 +155,11 @@ class Evaluator:
         """
         scratch, what = self._one, STD if std or self._falls_back else MEAN
         # slicing would cost as much as the arithmetic
-        query, blocks, features, work, memory, own, share = scratch.of_one
+        query, deflected, blocks, features, work, memory, own, share = scratch.of_one
         if covariance is not None:
             work, what = covariance, COVARIANCE
+        if len(motion) > POSITIONS:
+            query = deflected
         query[0] = motion
         if self._cross is not None:
             self._cross.fill_many(query, blocks)
@@ -158,6 +175,7 @@ class Evaluator:
             self._std_factor,
             self._floor,
             self._misfit,
+            SIGN_WIDTH,
             self._usual,
             query,
             what,
@@ -170,12 +188,12 @@ class Evaluator:
         return tau[0], deviation[0] if std else None, share[0].copy() if doubtful else None
 
     def many(
-        self, q: Array, dq: Array, ddq: Array, covariance: bool = False
+        self, q: Array, dq: Array, ddq: Array, covariance: bool = False, deflections: Array | None = None
     ) -> tuple[Array, Array, Array | None, Array | None]:
         """Return torques (N, n), their standard deviations (N, n) and, if requested, covariances (N, n, n).
 
-        Fourth, return the shares of the fallback, (N, n), or None if all are zero. q, dq, ddq: (N, n); neither shapes
-        nor finiteness are checked.
+        Fourth, return the shares of the fallback, (N, n), or None if all are zero. q, dq, ddq: (N, n); deflections: as
+        in `Motion`; neither shapes nor finiteness are checked.
         """
         scratch, (size, n) = self._many, q.shape
         tau, std, share = np.empty((size, n)), np.empty((size, n)), np.empty((size, n))
@@ -184,11 +202,14 @@ class Evaluator:
         for start in range(0, size, QUERIES):
             rows = slice(start, min(start + QUERIES, size))
             count = rows.stop - start
+            motions = (scratch.motions if deflections is None else scratch.deflected)[:count]
             for part, values in enumerate((q, dq, ddq)):
-                scratch.motions[:count, part] = values[rows]
+                motions[:, part] = values[rows]
+            if deflections is not None:
+                motions[:, POSITIONS:] = deflections[rows]
             work = scratch.covariance[:count] if covariances is None else covariances[rows]
             what = STD if covariances is None else COVARIANCE
-            doubtful |= self._answer(scratch, scratch.motions[:count], what, tau[rows], std[rows], work, share[rows])
+            doubtful |= self._answer(scratch, motions, motions, what, tau[rows], std[rows], work, share[rows])
         return tau, std, covariances, share if doubtful else None
 
     def fall_back(self, motions: Array, tau: Array, share: Array) -> Array:
@@ -196,17 +217,17 @@ class Evaluator:
 
         They are (1 − share) tau + share h, with the fallback h = (1 − share_s) s + share_s (t + p). s is the posterior
         mean at rest in the same posture, but with friction and payload in motion, and share_s its own share. t is the
-        mean torque in training, p the mean torque of the payload. motions: (N, 3, n).
+        mean torque in training, p the mean torque of the payload. motions: as of `Motion.arrays`.
         """
         scratch, harmless = self._many, np.empty_like(tau)
         slopes = self._slopes[self._payload]
         for start in range(0, len(tau), QUERIES):
             moving = np.ascontiguousarray(motions[start : start + QUERIES])
             rows, count = slice(start, start + len(moving)), len(moving)
-            scratch.motions[:count] = moving
-            scratch.motions[:count, 1:] = 0.0
+            still = scratch.motions[:count]
+            still[:, 0], still[:, 1:] = moving[:, 0], 0.0
             static, own = harmless[rows], scratch.share[:count]
-            self._answer(scratch, moving, STD, static, scratch.std[:count], scratch.covariance[:count], own)
+            self._answer(scratch, still, moving, STD, static, scratch.std[:count], scratch.covariance[:count], own)
             payload = np.einsum("p,kpj->kj", slopes, scratch.features[:count, self._payload])
             static[:] = (1.0 - own) * static + own * (self._usual_mean + payload)
         return np.asarray((1.0 - share) * tau + share * harmless)
@@ -224,11 +245,19 @@ class Evaluator:
         return self._fixed[: ROWS * size : ROWS][len(self._outputs) :]
 
     def _answer(
-        self, scratch: _Scratch, moving: Array, what: int, tau: Array, std: Array, covariance: Array, share: Array
+        self,
+        scratch: _Scratch,
+        motions: Array,
+        moving: Array,
+        what: int,
+        tau: Array,
+        std: Array,
+        covariance: Array,
+        share: Array,
     ) -> bool:
-        """Compute the first N queries in `scratch`. moving: (N, 3, n), their motion for friction and payload."""
-        count = len(moving)
-        motions, blocks, features = scratch.motions[:count], scratch.blocks[:count], scratch.features[:count]
+        """Compute N queries. moving: their motion for friction and payload."""
+        count = len(motions)
+        blocks, features = scratch.blocks[:count], scratch.features[:count]
         if self._cross is not None:
             self._cross.fill_many(motions, blocks)
         for first, fill_many, moves in self._fills_many:
@@ -241,6 +270,7 @@ class Evaluator:
             self._std_factor,
             self._floor,
             self._misfit,
+            SIGN_WIDTH,
             self._usual,
             motions,
             what,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,9 @@ from lipcore.data.motion import Motion
 from lipcore.data.repetition import measure_distinct_share
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
+from lipcore.kernels.drive.play import deflections_at
 from lipcore.kernels.drive.terms import SIGN_WIDTH
-from lipcore.kernels.fast.answer import ACCELERATED
+from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,19 @@ class MisfitOptions:
 
 
 OPTIONS = MisfitOptions()
+EARLIER_ROWS = 5
+"""Rows of a packed misfit of earlier releases."""
 
 
 @dataclass(frozen=True)
 class Misfit:
     """Variance in addition to noise and posterior, of joints at N velocities dq (eq. 25 of docs/method.md).
 
-        at rest      rest_j exp(−(dq_j / slow_j)²)
+        at rest      rest_j exp(−(dq_j / slow_j)²) + still_j exp(−(dq_j / w)²) + ⅓ (Σ_k |f_jk| h_jk)²
         faster       lasting_j (max(0, mean_i (dq_i / speed_i)² − 1) + ACCELERATED max(0, mean_i (ddq_i / u_i)² − 1))
 
-    u is `acceleration`. The variance of faster motion depends on all joints i.
+    u is `acceleration`, w is SIGN_WIDTH. The variance of faster motion depends on all joints i. h is the half width of
+    the range that a deflection lies in, f the torque of its element.
     """
 
     rest: Array
@@ -63,67 +67,81 @@ class Misfit:
     """Root mean square of dq in training, (n,)."""
     acceleration: Array
     """Root mean square of ddq in training, (n,)."""
+    still: Array
+    """Variance of friction of joints that stand still, beyond `rest`, (n,) (N·m)²."""
+    elements: Array = field(default_factory=lambda: np.zeros((2, 0, 1)))
+    """Torque |w| of the drive's play elements as trained, and their widths, (2, K, n)."""
 
     @classmethod
     def none(cls, n: int) -> Misfit:
         """Return a misfit of zero, for n joints."""
         zero, one = np.zeros(n), np.ones(n)
-        return cls(zero, one, zero, one, one)
+        return cls(zero, one, zero, one, one, zero)
 
     @classmethod
     def unpacked(cls, values: Array) -> Misfit:
-        """Return the misfit from the result of `packed`, (5, n)."""
-        return cls(*values)
+        """Return the misfit from the result of `packed`, or from the first five rows, of earlier releases."""
+        if len(values) == EARLIER_ROWS:
+            values = np.concatenate([values, np.zeros((1, values.shape[1]))])
+        rest, slow, lasting, speed, acceleration, still = values[:MISFIT_ROWS]
+        elements = values[MISFIT_ROWS:].reshape(2, (len(values) - MISFIT_ROWS) // 2, values.shape[1])
+        return cls(rest, slow, lasting, speed, acceleration, still, elements)
 
     def packed(self) -> Array:
-        """Return the fields as rows, (5, n)."""
-        return np.stack([self.rest, self.slow, self.lasting, self.speed, self.acceleration])
+        """Return the fields as rows, (6 + 2 K, n)."""
+        own = np.stack([self.rest, self.slow, self.lasting, self.speed, self.acceleration, self.still])
+        return np.concatenate([own, self.elements.reshape(-1, own.shape[1])])
 
     def of_joints(self, joints: NDArray[np.int64]) -> Misfit:
         """Return this misfit with the joints in another order. joints: (n,), their places in this misfit."""
         return Misfit.unpacked(self.packed()[:, joints])
 
     def with_friction(self, coulomb: Array) -> Misfit:
-        """Return this misfit with a variance at rest of at least `rest_share` × `coulomb`², (n,) N·m.
+        """Return this misfit for joints that stand still, with at least `rest_share` × `coulomb`² there, (n,) N·m.
 
-        This also applies to joints that never moved. A raised variance decays faster, so that it is unchanged at the
-        speed `slow`, but not below SIGN_WIDTH.
+        The part of the play elements is known, and does not count. This also applies to joints that never moved.
         """
-        rest = np.maximum(self.rest, OPTIONS.rest_share * coulomb**2)
-        least = np.finfo(float).tiny
-        raised = np.log(rest.clip(least)) - np.log(self.rest.clip(least))
-        slow = np.maximum(self.slow / np.sqrt(1.0 + raised), np.minimum(SIGN_WIDTH, self.slow))
-        return replace(self, rest=rest, slow=slow)
+        if self.elements.size:
+            coulomb = np.maximum(np.abs(coulomb) - self.elements[0].sum(axis=0), 0.0)
+        return replace(self, still=np.maximum(OPTIONS.rest_share * coulomb**2 - self.rest, 0.0))
 
     def with_rest(self, other: Misfit) -> Misfit:
-        """Return this misfit, with `rest` and `slow` of another misfit for joints with a larger `rest` there."""
-        larger = other.rest > self.rest
-        rest, slow = np.where(larger, other.rest, self.rest), np.where(larger, other.slow, self.slow)
-        return replace(self, rest=rest, slow=slow)
+        """Return this misfit, with the low speeds of another misfit for joints with a larger variance there."""
+        larger = other.rest + other.still > self.rest + self.still
+        low = {name: np.where(larger, getattr(other, name), getattr(self, name)) for name in ("rest", "slow", "still")}
+        return replace(self, **low)
 
     @property
     def is_nonzero(self) -> bool:
         """Whether any variance is above zero."""
-        return bool((self.rest > 0).any() or (self.lasting > 0).any())
+        parts = (self.rest, self.lasting, self.still, self.elements)
+        return any((each > 0).any() for each in parts)
 
-    def at_rest(self, dq: Array) -> Array:
-        """Return the variance of friction at low speed, (N, n) (N·m)². dq: (N, n)."""
-        return np.asarray(self.rest * np.exp(-((dq / self.slow) ** 2)))
+    def at_rest(self, motion: Motion) -> Array:
+        """Return the variance of friction at low speed, or after unknown motion, (N, n) (N·m)²."""
+        out = self.rest * np.exp(-((motion.dq / self.slow) ** 2))
+        out = out + self.still * np.exp(-((motion.dq / SIGN_WIDTH) ** 2))
+        if self.elements.size:
+            torque, widths = self.elements
+            known = motion.deflections
+            known = deflections_at(motion.dq, widths, self.acceleration) if known is None else known
+            out = out + np.square((torque * known[:, len(widths) :]).sum(axis=1)) / 3
+        return np.asarray(out)
 
     def variance(self, motion: Motion) -> Array:
         """Return the variance of the torques at N instants, (N, n) (N·m)²."""
         speed = ((motion.dq / self.speed) ** 2).mean(axis=-1, keepdims=True) - 1
         acceleration = ((motion.ddq / self.acceleration) ** 2).mean(axis=-1, keepdims=True) - 1
         faster = speed.clip(0.0) + ACCELERATED * acceleration.clip(0.0)
-        return np.asarray(self.at_rest(motion.dq) + self.lasting * faster)
+        return np.asarray(self.at_rest(motion) + self.lasting * faster)
 
-    def of_row(self, noise: Array, dq: Array, rows: float = INDEPENDENT_HZ * OPTIONS.lasting_s) -> Array:
+    def of_row(self, noise: Array, motion: Motion, rows: float = INDEPENDENT_HZ * OPTIONS.lasting_s) -> Array:
         """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)².
 
         White noise is new in every row. A lasting error is common to `rows` rows, which count together as one. noise:
         (n,) (N·m)², white or lasting.
         """
-        return noise + (rows - 1) * self.lasting + rows * self.at_rest(dq)
+        return noise + (rows - 1) * self.lasting + rows * self.at_rest(motion)
 
 
 def shared_rows(samples: Samples, joint_types: Sequence[str], count: int) -> float:
@@ -153,7 +171,7 @@ def estimate_misfit(
     white = np.minimum(*(noise_level([each[part] for part in episodes]) for each in (residual, tau)))
     lasting = np.maximum(noise - OPTIONS.white_ratio * white**2, 0.0)
     usual = np.maximum(np.sqrt(np.mean(motion**2, axis=1)), SIGN_WIDTH)
-    return Misfit(rest, slow, lasting, *usual), noise
+    return Misfit(rest, slow, lasting, usual[0], usual[1], np.zeros_like(rest)), noise
 
 
 def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]:

@@ -80,9 +80,9 @@ class Summing:
         out = np.empty((len(samples) * n, len(self.basis)))
         for start in range(0, len(samples), PIECE):
             part = slice(start, start + PIECE)
-            motion = Motion(*(each[part] for each in (samples.q, samples.dq, samples.ddq)))
+            motion = samples.rows(part).motion()
             residual = np.ascontiguousarray(samples.tau[part] - self.kernel.mean(motion))
-            noise = self.misfit.of_row(self.noise_variance, motion.dq)
+            noise = self.misfit.of_row(self.noise_variance, motion)
             piece = out[start * n : (start + len(motion)) * n]
             self._features(motion, piece)
             weigh(piece, first, self.basis.prior(motion), noise, weights[part], residual, total.b)
@@ -103,7 +103,7 @@ class Summing:
 
     def _elsewhere(self, total: Total, samples: Samples, weights: Array) -> Array:
         motion = samples.motion()
-        noise = self.misfit.of_row(self.noise_variance, motion.dq)
+        noise = self.misfit.of_row(self.noise_variance, motion)
         features, more = self._moved.weighed(motion, samples.tau - self.kernel.mean(motion), noise, weights)
         total.b += more
         return features

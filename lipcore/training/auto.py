@@ -235,7 +235,7 @@ class EstimatorComparison:
         try:
             model = self.work.fit(self.training, name, place, learnt)
             samples = self.held.samples
-            torque = model.predict(samples.q, samples.dq, samples.ddq)
+            torque = model.predict_along(samples)
             answer = torque.interval
             density = -float(evaluate(samples.tau, *answer).nlpd.sum())
             if not np.isfinite(density):

@@ -126,10 +126,12 @@ def compact(
     noise = posterior.noise_variance
     moved = np.stack([contiguous.dq, contiguous.ddq])
     misfit, _ = estimate_misfit(residual, contiguous.tau, moved, contiguous.episodes(), noise)
+    if rigid is not None and estimator.name in ROBOT_ESTIMATORS:
+        misfit = replace(misfit, elements=rigid.elements)
     misfit = misfit.with_friction(friction_coefficients(posterior, estimator).coulomb)
     misfit = misfit if rigid is None else misfit.with_rest(rigid)
     motion = used.motion()
-    variance = misfit.of_row(noise, motion.dq, shared_rows(task.samples, task.joint_types, len(used)))
+    variance = misfit.of_row(noise, motion, shared_rows(task.samples, task.joint_types, len(used)))
     statistics = collect(posterior.basis, variance, motion, used.tau - estimator.kernel.mean(motion))
     counted = CompactPosterior.build(estimator.kernel, posterior.basis, statistics, noise, factor, misfit)
     independent = float((noise / variance).mean(axis=1).sum())

@@ -24,7 +24,7 @@ WIDENED_PREFIX = "widened_"
 
 def widen_intervals(model: TorqueModel, samples: Samples) -> TorqueModel:
     """Return the model with intervals widened to a coverage of 95 % of the torques of held-out samples."""
-    factors = model.predict(samples.q, samples.dq, samples.ddq).interval.width_factor(samples.tau)
+    factors = model.predict_along(samples).interval.width_factor(samples.tau)
     known = {
         joint: float(model.fit.get(f"{WIDENED_PREFIX}{joint + 1}", 1.0)) * each for joint, each in enumerate(factors)
     }

@@ -14,6 +14,7 @@ from lipcore.estimators.catalogue import check_estimator
 from lipcore.estimators.hyperparameters import Cancelled, Progress
 from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
+from lipcore.kernels.drive.play import with_deflections
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.sibling import arm_of_sibling
 from lipcore.model.torque_model import TorqueModel
@@ -79,6 +80,7 @@ def train(
             None if robot is None else robot.name,
         )
         robot, sibling = base.robot, arm_of_sibling(base)
+    samples = with_deflections(samples, types)
     task = Task(
         samples,
         types,

@@ -2,41 +2,96 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from array_api_compat import array_namespace
 
-from lipcore.data.motion import Array, Motion
-from lipcore.kernels.arm_prior import Arm
+from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.drive.terms import SHAPE_SPEEDS, SIGN_WIDTH, STRIBECK_SPEED, check_kinds, drive_terms
 from lipcore.kernels.fast.drive import drive_queries, drive_query, drive_size, linear_features
 from lipcore.kernels.fast.views import Memory
-from lipcore.vocabulary import DRIVE_KINDS
+from lipcore.kernels.geometry import Geometry
+from lipcore.vocabulary import DRIVE_KINDS, DriveKind
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """The bodies that the kind `load` needs."""
+
+    geometry: Geometry
+    """Geometry, base to tip."""
+    parameters: Array
+    """Inertial parameters, (n, 10), base to tip."""
+    order: Indices
+    """The data's joint at each place of the chain, (n,)."""
+
+
+@dataclass(frozen=True)
+class Elements:
+    """The elements that the kind `play` needs."""
+
+    widths: Array
+    """Widths, (K, n) rad (m)."""
+    acceleration: Array
+    """Usual acceleration of the joints, (n,) rad/s² (m/s²)."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Friction of n joints: its kinds, and what their terms depend on. Raise ValueError if that is missing."""
+
+    n_joints: int
+    kinds: tuple[DriveKind, ...] = ()
+    """Kinds beyond viscous, Coulomb and offset, in their usual order."""
+    bodies: Bodies | None = None
+    elements: Elements | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kinds", check_kinds(self.kinds))
+        for kind, needs, given in (("load", "bodies", self.bodies), ("play", "elements", self.elements)):
+            if kind in self.kinds and given is None:
+                raise ValueError(f"drive kind {kind!r} needs {needs}")
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Names of a joint's terms, (f,)."""
+        return drive_terms(self.kinds)
+
+    @cached_property
+    def regressor(self) -> DriveRegressor:
+        """The regressor that computes the terms."""
+        return DriveRegressor(self)
+
+    def by_joint(self, motions: Array) -> Array:
+        """Return each joint's terms, (N, n, f). motions: as of `Motion.arrays`."""
+        return self.regressor.linear(motions)[:, :, 1:]
+
+    def features(self, motions: Array) -> Array:
+        """Return the features P of N motions, joint by joint, (N, n, f n) (section 5 of docs/method.md)."""
+        rows = np.empty((len(motions), self.regressor.size, self.n_joints))
+        self.regressor.fill_many(motions, rows, 0)
+        return np.ascontiguousarray(rows.transpose(0, 2, 1))
 
 
 class DriveKernel(LinearKernel):
-    """Friction tau_i = Σ_k f_ik φ_k(dq_i, |τ_i|) with the terms φ of `lipcore.kernels.drive.terms`.
+    """Friction tau_i = Σ_k f_ik φ_k with the terms φ of `lipcore.kernels.drive.terms`.
 
-    The load τ is the torque that the bodies of `arm` need, `newton_euler.rigid_body_torque` at the arm's parameters: a
-    function of the query, not of the weights.
+    The load |τ| is the torque that the bodies need, `newton_euler.rigid_body_torque`: a function of the query, not of
+    the weights.
 
-    Weights: (f n,), joint by joint; `terms` contains the names of a joint's f. Hyperparameter: `friction.log_std`
-    (n, f).
-
-    n_joints: n; kinds: of the drive, beyond viscous, Coulomb and offset; arm: its bodies, for the kind `load`.
+    Weights: (f n,), joint by joint; `drive.terms` contains the names of a joint's f. Hyperparameter:
+    `friction.log_std` (n, f).
     """
 
-    def __init__(self, n_joints: int, kinds: Sequence[str] = (), arm: Arm | None = None) -> None:
-        self.n_joints, self.kinds, self.arm = n_joints, check_kinds(kinds), arm
-        if "load" in self.kinds and arm is None:
-            raise ValueError("drive kind 'load' needs an arm")
-        self.terms = drive_terms(self.kinds)
+    def __init__(self, drive: Drive) -> None:
+        self.n_joints, self.drive = drive.n_joints, drive
 
-    def regressor(self) -> DriveRegressor:
+    def regressor(self) -> Regressor:
         """Return the regressor that computes the terms of single queries."""
-        return DriveRegressor(self)
+        return self.drive.regressor
 
     def variances(self, params: Params) -> Array:
         """Return the prior variances of the weights, (f n,)."""
@@ -51,41 +106,48 @@ class DriveKernel(LinearKernel):
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Start every term with a tenth of each joint's torque at the term's usual size: log std (n, f)."""
         usual = 0.1 * np.sqrt(np.square(tau).mean(0)).clip(1e-6)
-        size = np.sqrt(np.square(self.by_joint(motion)).mean(axis=0)).clip(1e-3)  # (n, f)
+        size = np.sqrt(np.square(self.drive.by_joint(motion.arrays())).mean(axis=0)).clip(1e-3)  # (n, f)
         size[:, 1:3] = 1.0  # the sign and the offset, whatever the motion
         return {"friction.log_std": np.log(usual[:, None] / size)}
 
-    def by_joint(self, motion: Motion) -> Array:
-        """Return each joint's terms, (N, n, f)."""
-        return self.regressor().linear(motion.arrays())[:, :, 1:]
-
 
 class DriveRegressor(Regressor):
-    """Terms of `DriveKernel` for single queries, compiled."""
+    """Terms of a drive for single queries, compiled."""
 
-    def __init__(self, kernel: DriveKernel) -> None:
-        self.n_joints = n = kernel.n_joints
-        self._terms = len(kernel.terms)
+    def __init__(self, drive: Drive) -> None:
+        self.n_joints = n = drive.n_joints
+        self._terms = len(drive.terms)
         self.size = self._terms * n
-        arm = kernel.arm if "load" in kernel.kinds else None
-        self._order = np.arange(n) if arm is None else arm.order.astype(np.int64)
-        self._kinds = np.array([int(kind in kernel.kinds) for kind in DRIVE_KINDS])
+        bodies, elements = drive.bodies if "load" in drive.kinds else None, drive.elements
+        self._order = np.arange(n) if bodies is None else bodies.order.astype(np.int64)
+        self._kinds = np.array([int(kind in drive.kinds) for kind in DRIVE_KINDS])
         self._constants = np.array([SIGN_WIDTH, STRIBECK_SPEED, *SHAPE_SPEEDS])
-        bodies = () if arm is None else (arm.geometry.constants, arm.geometry.gravity, arm.parameters)
-        self._memory = Memory(bodies, n if arm is None else drive_size(n))
+        self._elements = np.zeros((1, n))
+        if elements is not None:
+            self._elements = np.concatenate([elements.widths, elements.acceleration[None]])
+        fixed = () if bodies is None else (bodies.geometry.constants, bodies.geometry.gravity, bodies.parameters)
+        self._memory = Memory(fixed, n if bodies is None else drive_size(n))
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (f n, n)."""
-        drive_query(self._memory.flat, self._order, self._kinds, self._constants, motion, out)
+        drive_query(self._memory.flat, self._order, self._kinds, self._constants, self._elements, motion, out)
 
     def fill_many(self, motions: Array, out: Array, first: int) -> None:
         """Write Φᵀ of N queries; see `Regressor.fill_many`."""
         drive_queries(
-            self._memory.flat, self._order, self._kinds, self._constants, motions, out, first, first + self.size
+            self._memory.flat,
+            self._order,
+            self._kinds,
+            self._constants,
+            self._elements,
+            motions,
+            out,
+            first,
+            first + self.size,
         )
 
     def linear(self, motions: Array) -> Array:
-        """Return ddq and each joint's terms at N queries, (N, n, 1 + f). motions: (N, 3, n)."""
+        """Return ddq and each joint's terms at N queries, (N, n, 1 + f). motions: as of `Motion.arrays`."""
         out = np.empty((len(motions), self.n_joints, 1 + self._terms))
-        linear_features(self._memory.flat, self._order, self._kinds, self._constants, motions, out)
+        linear_features(self._memory.flat, self._order, self._kinds, self._constants, self._elements, motions, out)
         return out

@@ -9,7 +9,9 @@ With the velocity v, its smoothed sign s = tanh(v / w), and the torque τ that t
     speed     tanh(v / 0.1), tanh(v / 0.4), tanh(v / 1.5), v |v|             it is not linear in speed
     sides     |s|, |v|                                                       it differs between the directions
     load      |τ| s, |τ| v                                                   it grows with the torque carried
+    play      e₁ … e_K                                                       it remembers where the joint came from
 
+The deflections e of the play elements are those of `lipcore.kernels.drive.play`.
 Every drive has the first three. The others are kinds that a recording has to support (`lipcore.arm.drive`).
 """
 
@@ -21,6 +23,7 @@ from typing import cast
 import numpy as np
 
 from lipcore.data.motion import Array
+from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 
 SIGN_WIDTH = 0.02
@@ -37,6 +40,7 @@ KIND_TERMS: dict[DriveKind, tuple[str, ...]] = {
     "speed": ("speed_slow", "speed_medium", "speed_fast", "speed_square"),
     "sides": ("side", "side_viscous"),
     "load": ("load", "load_viscous"),
+    "play": tuple(f"play_{number}" for number in range(1, len(ELEMENTS) + 1)),
 }
 
 
@@ -54,10 +58,13 @@ def drive_terms(kinds: Sequence[DriveKind] = ()) -> tuple[str, ...]:
     return (*BASE_TERMS, *(term for kind in kinds for term in KIND_TERMS[kind]))
 
 
-def drive_features(dq: Array, kinds: Sequence[DriveKind] = (), load: Array | None = None) -> Array:
+def drive_features(
+    dq: Array, kinds: Sequence[DriveKind] = (), load: Array | None = None, deflections: Array | None = None
+) -> Array:
     """Return the terms of N velocities, (f, N, n).
 
-    dq: (N, n) rad/s (m/s); load: (N, n) N·m (N), the absolute torque that the bodies need; for the kind `load`.
+    dq: (N, n) rad/s (m/s); load: (N, n) N·m (N), the absolute torque that the bodies need, for the kind `load`;
+    deflections: (N, K, n), expected ones, for the kind `play`.
     """
     sign, speed = np.tanh(dq / SIGN_WIDTH), np.abs(dq)
     parts = [dq, sign, np.ones_like(dq)]
@@ -70,26 +77,32 @@ def drive_features(dq: Array, kinds: Sequence[DriveKind] = (), load: Array | Non
     if "load" in kinds:
         assert load is not None  # the caller computes it
         parts += [load * sign, load * dq]
+    if "play" in kinds:
+        assert deflections is not None  # the caller computes them
+        parts += list(deflections.swapaxes(0, 1))
     return np.stack(parts)
 
 
 def summary_rows(kinds: Sequence[DriveKind]) -> dict[str, Array]:
     """Return the row, (f,), that turns a joint's coefficients into each number of a report.
 
-    `viscous`, `coulomb`, `offset`, and `stribeck` and `load` if they are modelled. With `speed` or `sides`, several
-    terms are similar. `viscous` is then the slope of friction from SUMMARY_SPEEDS[0] to SUMMARY_SPEEDS[1], `coulomb`
-    the friction that this line has at standstill, and `offset` the mean of both directions at the lower speed.
+    `viscous`, `coulomb`, `offset`, and `stribeck` and `load` if they are modelled. `coulomb` includes the play
+    elements, which have slipped in steady motion. With `speed` or `sides`, several terms are similar. `viscous` is then
+    the slope of friction from SUMMARY_SPEEDS[0] to SUMMARY_SPEEDS[1], `coulomb` the friction that this line has at
+    standstill, and `offset` the mean of both directions at the lower speed.
     """
     terms = drive_terms(kinds)
     rows = {name: np.array([float(term == name) for term in terms]) for name in (*BASE_TERMS, "stribeck", "load")}
     rows = {name: row for name, row in rows.items() if row.any()}
+    slipped = np.array([float(term in KIND_TERMS["play"]) for term in terms])
     if not {"speed", "sides"} & set(kinds):
-        return rows
+        return {**rows, "coulomb": rows["coulomb"] + slipped}
     low, high = SUMMARY_SPEEDS
     counted = np.array([term not in ("stribeck", *KIND_TERMS["load"]) for term in terms])
-    speeds = np.array([[low], [high]])
+    speeds, still = np.array([[low], [high]]), np.zeros((2, len(ELEMENTS), 1))
     ahead, back = (
-        drive_features(each, kinds, np.zeros_like(each))[:, :, 0] * counted[:, None] for each in (speeds, -speeds)
+        drive_features(each, kinds, np.zeros_like(each), still + np.sign(each[0]))[:, :, 0] * counted[:, None]
+        for each in (speeds, -speeds)
     )
     odd = 0.5 * (ahead - back)
     viscous = (odd[:, 1] - odd[:, 0]) / (high - low)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lipcore.kernels.fast.compile import brief, compiled, inlined
 from lipcore.kernels.fast.lanes import LANES, spread
+from lipcore.kernels.fast.play import half_range
 from lipcore.kernels.fast.views import lay, numbers
 
 Array = NDArray[np.float64]
@@ -55,6 +56,8 @@ def multiply(panels: Array, panel: int, columns: Array, first: int, count: int, 
     y[0], y[1], y[2], y[3], y[4], y[5] = a, b, c, d, e, f
 
 
+MISFIT_ROWS = 6
+"""Rows of a misfit before those of the play elements."""
 MEAN, STD, COVARIANCE = range(3)  # how much to compute: each value includes the ones before
 FALLBACK_START, FALLBACK_END = 1.0, 3.0
 """Posterior variance of a torque, as a multiple of its training variance, at which the fallback starts and is complete.
@@ -88,6 +91,7 @@ def answer(
     std_factor: float,
     floor: Array,
     misfit: Array,
+    sign_width: float,
     usual: Array,
     motions: Array,
     what: int,
@@ -106,10 +110,12 @@ def answer(
     - blocks: (N, S + 1, n, n), from `Cross`;
     - features: (N, P, n), Φᵀ;
     - floor: (n,), min variance, at least 0;
-    - misfit: (5, n), see `Misfit.packed`: variance at rest, the speed at which it has decayed to exp(−1), variance of
-      faster motion, and the usual speed and acceleration;
+    - misfit: (6 + 2 K, n), see `Misfit.packed`: variance at rest, the speed at which it has decayed to exp(−1),
+      variance of faster motion, the usual speed and acceleration, variance at standstill, torque and widths of the play
+      elements;
+    - sign_width: speed at which the variance at standstill has decayed to exp(−1);
     - usual: (n,), training variance of the torque, infinite if unknown;
-    - motions: (N, 3, n), of which dq and ddq are read;
+    - motions: (N, …, n), of which dq, ddq and the deflections are read;
     - tau, std: (N, n);
     - covariance: (N, n, n), work memory unless requested;
     - share: (N, n), of the fallback, see `fallback_share`; not written for MEAN.
@@ -147,9 +153,22 @@ def answer(
             share[query, j] = fallback_share(covariance[query, j, j], usual[j])
             any_share |= share[query, j] > 0.0
             more = misfit[0, j] * np.exp(-((motions[query, 1, j] / misfit[1, j]) ** 2)) + misfit[2, j] * faster
+            more += misfit[5, j] * np.exp(-((motions[query, 1, j] / sign_width) ** 2))
+            more += _of_elements(misfit, motions[query], j)
             covariance[query, j, j] = max(covariance[query, j, j] + more, floor[j])
             std[query, j] = np.sqrt(covariance[query, j, j])
     return any_share
+
+
+@inlined
+def _of_elements(misfit: Array, motion: Array, joint: int) -> float:
+    """Return the variance of the play elements' unknown deflections at a joint."""
+    count = (misfit.shape[0] - MISFIT_ROWS) // 2
+    torque = 0.0
+    for k in range(count):
+        width = misfit[MISFIT_ROWS + count + k, joint]
+        torque += misfit[MISFIT_ROWS + k, joint] * half_range(motion, joint, k, count, width, misfit[4, joint])
+    return torque * torque / 3.0
 
 
 @brief
@@ -161,6 +180,7 @@ def answer_one(
     std_factor: float,
     floor: Array,
     misfit: Array,
+    sign_width: float,
     usual: Array,
     motions: Array,
     what: int,
@@ -179,6 +199,7 @@ def answer_one(
         std_factor,
         floor,
         misfit,
+        sign_width,
         usual,
         motions,
         what,

@@ -2,10 +2,11 @@
 
 Common arguments:
 
-- kinds: (4,), one for each of `DRIVE_KINDS`: 1 if the drive has it, else 0;
+- kinds: (5,), one for each of `DRIVE_KINDS`: 1 if the drive has it, else 0;
 - memory: `Memory` of the arm's constants, gravity and parameters, with `drive_size` elements to work in; without the
   kind `load`, only n elements;
-- order: (n,), the data's joint at each place of the chain.
+- order: (n,), the data's joint at each place of the chain;
+- elements: (K + 1, n), widths of the play elements and the usual acceleration; (1, n) without the kind `play`.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from lipcore.kernels.fast.arm_recursion import (
     torques,
 )
 from lipcore.kernels.fast.compile import brief, compiled, inlined
+from lipcore.kernels.fast.play import expected_deflection
 from lipcore.kernels.fast.views import numbers
 
-STRIBECK, SPEED, SIDES, LOAD = range(4)
+STRIBECK, SPEED, SIDES, LOAD, PLAY = range(5)
 """Places of the kinds."""
 
 
@@ -36,12 +38,21 @@ def drive_size(n: int) -> int:
 
 @inlined
 def _write_terms(
-    velocity: float, load: float, kinds: Indices, constants: Array, out: Array, row: int, column: int
+    motion: Array,
+    joint: int,
+    load: float,
+    kinds: Indices,
+    constants: Array,
+    elements: Array,
+    out: Array,
+    row: int,
+    column: int,
 ) -> None:
     """Write a joint's terms into a column of `out`, from a row on.
 
     constants: (5,), speeds of the sign, of `stribeck` and of the three shapes.
     """
+    velocity = motion[1, joint]
     sign, speed = np.tanh(velocity / constants[0]), abs(velocity)
     out[row, column] = velocity
     out[row + 1, column] = sign
@@ -62,6 +73,10 @@ def _write_terms(
     if kinds[LOAD]:
         out[row, column] = load * sign
         out[row + 1, column] = load * velocity
+        row += 2
+    if kinds[PLAY]:
+        for k in range(elements.shape[0] - 1):
+            out[row + k, column] = expected_deflection(motion, joint, k, elements)
 
 
 @compiled
@@ -82,7 +97,9 @@ def _write_load(memory: Array, order: Indices, kinds: Indices, motion: Array, lo
 
 
 @brief
-def drive_query(memory: Array, order: Indices, kinds: Indices, constants: Array, motion: Array, out: Array) -> None:
+def drive_query(
+    memory: Array, order: Indices, kinds: Indices, constants: Array, elements: Array, motion: Array, out: Array
+) -> None:
     """Write joint j's terms into rows f j to f j + f − 1 of `out`, (f n, n), in column j. Other elements are zero."""
     n = order.shape[0]
     load = memory[memory.shape[0] - n :]
@@ -90,27 +107,35 @@ def drive_query(memory: Array, order: Indices, kinds: Indices, constants: Array,
     out[:] = 0.0
     terms = out.shape[0] // n
     for joint in range(n):
-        _write_terms(motion[1, joint], load[joint], kinds, constants, out, terms * joint, joint)
+        _write_terms(motion, joint, load[joint], kinds, constants, elements, out, terms * joint, joint)
 
 
 @compiled
 def drive_queries(
-    memory: Array, order: Indices, kinds: Indices, constants: Array, motions: Array, out: Array, first: int, last: int
+    memory: Array,
+    order: Indices,
+    kinds: Indices,
+    constants: Array,
+    elements: Array,
+    motions: Array,
+    out: Array,
+    first: int,
+    last: int,
 ) -> None:
-    """Write the terms of N queries, (N, 3, n), into rows `first` to `last` of each part of `out`, (N, …, n)."""
+    """Write the terms of N queries, (N, …, n), into rows `first` to `last` of each part of `out`, (N, …, n)."""
     for k in range(motions.shape[0]):
-        drive_query(memory, order, kinds, constants, motions[k], out[k, first:last])
+        drive_query(memory, order, kinds, constants, elements, motions[k], out[k, first:last])
 
 
 @compiled
 def linear_features(
-    memory: Array, order: Indices, kinds: Indices, constants: Array, motions: Array, out: Array
+    memory: Array, order: Indices, kinds: Indices, constants: Array, elements: Array, motions: Array, out: Array
 ) -> None:
-    """Write ddq and the terms of each joint, (N, n, 1 + f). motions: (N, 3, n)."""
+    """Write ddq and the terms of each joint, (N, n, 1 + f). motions: (N, …, n)."""
     n = order.shape[0]
     load = memory[memory.shape[0] - n :]
     for k in range(motions.shape[0]):
         _write_load(memory, order, kinds, motions[k], load)
         for j in range(n):
             out[k, j, 0] = motions[k, 2, j]
-            _write_terms(motions[k, 1, j], load[j], kinds, constants, out[k].T, 1, j)
+            _write_terms(motions[k], j, load[j], kinds, constants, elements, out[k].T, 1, j)

@@ -23,7 +23,7 @@ def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
     posterior = carrier.model.posterior
     noise, misfit = posterior.noise_variance, posterior.misfit
     white = np.maximum(noise - misfit.lasting, 1e-3 * noise)
-    rest = misfit.at_rest(motion.dq)
+    rest = misfit.at_rest(motion)
     return white, (misfit.lasting + misfit.variance(motion) - rest), rest
 
 

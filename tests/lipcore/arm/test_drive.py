@@ -13,7 +13,7 @@ from lipcore.arm.drive import choose_drive, held_out_errors
 from lipcore.arm.posing import make_problem, with_kind
 from lipcore.arm.problem import Point, Problem
 from lipcore.data.motion import Motion
-from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.kernel import Drive
 from lipcore.kernels.drive.terms import drive_features, drive_terms, summary_rows
 from lipcore.model.dynamics import forward_dynamics
 from lipcore.model.parameters import friction_coefficients
@@ -137,10 +137,10 @@ def test_report_of_curved_friction_is_a_line_through_its_curve() -> None:
 
 
 def test_unknown_kinds_and_a_load_without_arm_are_rejected() -> None:
-    with pytest.raises(ValueError, match="drive kind is 'cogging', expected one of stribeck, speed, sides, load"):
-        DriveKernel(3, ("cogging",))
-    with pytest.raises(ValueError, match="'load' needs an arm"):
-        DriveKernel(3, ("load",))
+    with pytest.raises(ValueError, match="drive kind is 'cogging', expected one of stribeck, speed, sides, load, play"):
+        Drive(3, ("cogging",))
+    with pytest.raises(ValueError, match="'load' needs bodies"):
+        Drive(3, ("load",))
 
 
 def test_model_with_load_is_stored_and_restored(tmp_path) -> None:

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators import noise
 from lipcore.kernels.base import SumKernel
-from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.posterior.exact import negative_log_evidence, noisy_gram
 from tests.lipcore.data.test_metrics import recording
 from tests.lipcore.oracles import random_problem
@@ -35,7 +35,7 @@ class Draw(NamedTuple):
 
 def draw(samples: int, seed: int) -> Draw:
     problem = random_problem(JOINTS, samples, seed, "chain")
-    both = SumKernel(problem.kernel, DriveKernel(3))
+    both = SumKernel(problem.kernel, DriveKernel(Drive(3)))
     params = {**problem.params, "noise.log_std": np.log(TRUE_STD)}
     lower = np.linalg.cholesky(noisy_gram(both, params, problem.motion))
     white = np.random.default_rng(seed).standard_normal(3 * samples)

@@ -196,8 +196,8 @@ def test_wrong_manifest_entry_is_named(folder: Path, changes: dict[str, Any], me
         ("inducing/outputs", np.zeros(2), "'inducing/outputs' is of type 'F64', expected I64"),
         ("inducing/outputs", np.array([0, 0]), "distinct places of torques"),
         ("inducing/outputs", np.array([0, 5000]), "outputs reaches from 0 to 5000"),
-        ("misfit", np.zeros((3, 2)), r"'misfit' has shape \(3, 2\), expected \(5, 2\)"),
-        ("misfit", np.ones((4, 2)), r"tensor 'misfit' has shape \(4, 2\), expected \(5, 2\)"),  # before 0.2.0
+        ("misfit", np.zeros((3, 2)), r"'misfit' has shape \(3, 2\), expected \(16, 2\)"),
+        ("misfit", np.ones((4, 2)), r"tensor 'misfit' has shape \(4, 2\), expected \(16, 2\)"),  # before 0.2.0
         ("misfit", -np.ones((5, 2)), "'misfit' has a number below zero"),
     ],
     ids=lambda value: value if isinstance(value, str) and "/" in value else "",

@@ -8,7 +8,7 @@ import pytest
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import make_estimator
 from lipcore.kernels.base import SumKernel
-from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.drive.terms import SIGN_WIDTH, STRIBECK_SPEED
 from lipcore.kernels.lip import LipKernel
 from lipcore.posterior.exact import negative_log_evidence
@@ -20,10 +20,10 @@ JOINTS = ("revolute", "prismatic", "revolute")
 
 def test_sum_has_the_hyperparameters_of_all_terms() -> None:
     problem = random_problem(JOINTS, samples=4, seed=3)
-    initial = SumKernel(problem.kernel, DriveKernel(3)).initial(problem.motion, problem.motion.q)
+    initial = SumKernel(problem.kernel, DriveKernel(Drive(3))).initial(problem.motion, problem.motion.q)
     assert initial.keys() == problem.params.keys() - {"noise.log_std"}
     with pytest.raises(ValueError, match=r"\[2, 3\] joints"):
-        SumKernel(LipKernel(JOINTS), DriveKernel(2))
+        SumKernel(LipKernel(JOINTS), DriveKernel(Drive(2)))
 
 
 def features(speed: float) -> list[float]:
@@ -36,7 +36,7 @@ def test_block_is_the_covariance_of_independent_weights(terms: int) -> None:
     motion = random_problem(JOINTS, samples=4, seed=1).motion
     std = np.exp(np.random.default_rng(1).normal(size=(3, terms)))
     motion = Motion(motion.q, 0.02 * motion.dq, motion.ddq)  # slow enough to change the sign
-    kernel = DriveKernel(3, ("stribeck",)[: terms - 3])
+    kernel = DriveKernel(Drive(3, ("stribeck",)[: terms - 3]))
     gram = kernel.gram({"friction.log_std": np.log(std)}, motion, motion).reshape(4, 3, 4, 3)
     for x in range(4):
         for y in range(4):

@@ -4,7 +4,7 @@ Other tests compare the formulas with automatic differentiation, plain loops and
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -18,7 +18,8 @@ from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.base import LinearKernel, PairKernel, State, SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.drive.kernel import DriveKernel
-from lipcore.kernels.drive.terms import drive_features
+from lipcore.kernels.drive.play import ELEMENTS, deflections_at, element_widths
+from lipcore.kernels.drive.terms import drive_features, drive_terms
 from lipcore.kernels.fast.lanes import LANES
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
@@ -38,6 +39,8 @@ GEOMETRY_STEP = 1e-4
 """Step of central differences by the geometry, rad and m; they are exact to about GEOMETRY_STEP⁴."""
 GEOMETRY_TOLERANCE = 1e-9
 """Relative tolerance for derivatives by the geometry."""
+
+KINDS_OF_ARM: tuple[DriveKind, ...] = ("stribeck", "load", "play")
 
 Features = Callable[[Motion], Array]
 
@@ -85,7 +88,10 @@ def arm_features(arm: Arm, motion: Motion) -> Array:
 
 def drive_terms_of(arm: Arm, kinds: Sequence[DriveKind], motion: Motion) -> Array:
     """Return the terms of friction with the torque of an arm's bodies as the load, (f, N, n)."""
-    return drive_features(motion.dq, kinds, np.abs(bodies_torque(arm.geometry, arm.order, arm.parameters, motion)))
+    load, known = np.abs(bodies_torque(arm.geometry, arm.order, arm.parameters, motion)), motion.deflections
+    if known is None:
+        known = deflections_at(motion.dq, element_widths(arm.joint_types), arm.acceleration)
+    return drive_features(motion.dq, kinds, load, known[:, : len(ELEMENTS)])
 
 
 def mixture_features(kernel: MixtureKernel, arm: Arm, motion: Motion) -> Array:
@@ -111,7 +117,7 @@ def random_arm(joint_types: Sequence[str], others: int = 0) -> Arm:
             geometry.moved(0.1 * k * rng.standard_normal(geometry.size)),
             random_bodies(n, k),
             0.1 * rng.random(n),
-            rng.random((n, 6)),
+            rng.random((n, len(drive_terms(KINDS_OF_ARM)))),
             float(shares[k]),
         )
         for k in range(others + 1)
@@ -125,7 +131,8 @@ def random_arm(joint_types: Sequence[str], others: int = 0) -> Arm:
         bodies,
         bodies,
         *units,
-        drive=("stribeck", "load"),
+        drive=KINDS_OF_ARM,
+        acceleration=0.5 + rng.random(n),
         alternatives=alternatives if others else (),
     )
 
@@ -165,7 +172,7 @@ def friction_case(joint_types: Sequence[str], kinds: Sequence[DriveKind] = ()) -
         terms = drive_terms_of(arm, kinds, motion)
         return np.einsum("fki,ij->kijf", terms, np.eye(n)).reshape(len(motion), n, -1)
 
-    return Case(DriveKernel(n, kinds, arm if "load" in kinds else None), [features])
+    return Case(DriveKernel(replace(arm.friction, kinds=tuple(kinds))), [features])
 
 
 def sum_case(joint_types: Sequence[str]) -> Case:
@@ -200,10 +207,13 @@ every_kernel = pytest.mark.parametrize("name", CASES)
 robots = pytest.mark.parametrize("joint_types", JOINTS.values(), ids=JOINTS)
 
 
-def draw_problem(kernel: TorqueKernel, samples: int) -> tuple[dict[str, Array], Motion]:
-    """Return hyperparameters around the kernel's start, and random motion."""
+def draw_problem(kernel: TorqueKernel, samples: int, known: bool = False) -> tuple[dict[str, Array], Motion]:
+    """Return hyperparameters around the kernel's start, and random motion. known: whether deflections are known."""
     rng = np.random.default_rng(samples)
     motion, training = (Motion(*rng.uniform(-2, 2, (3, size, kernel.n_joints))) for size in (samples, 20))
+    if known:
+        deflections = rng.uniform(-1, 1, (samples, 2 * len(ELEMENTS), kernel.n_joints))
+        motion = replace(motion, deflections=deflections)
     start = kernel.initial(training, rng.normal(0, 5, training.q.shape))
     return {name: np.asarray(value + 0.3 * rng.standard_normal(value.shape)) for name, value in start.items()}, motion
 
@@ -282,7 +292,7 @@ def test_query_covariances_equal_the_formula(name: str, joint_types: tuple[str, 
     case, n = CASES[name](joint_types), len(joint_types)
     kernel = case.kernel
     for size in SIZES:
-        params, motion = draw_problem(kernel, size + 2)
+        params, motion = draw_problem(kernel, size + 2, known=size > 1)
         query, inducing = motion[:2], motion[2:]
         if isinstance(kernel, PairKernel):
             found = np.full((2, size + 1, n, n), np.nan)  # shows any entry that is not written

@@ -12,7 +12,7 @@ from lipcore.data.motion import Array, Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
-from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.posterior.evaluator import QUERIES, Evaluator
 from lipcore.robots.library import load_robot
 from lipcore.robots.urdf import RigidBody
@@ -106,7 +106,7 @@ def case(
 
 
 def friction(n: int) -> tuple[LinearKernel, ...]:
-    return (DriveKernel(n),)
+    return (DriveKernel(Drive(n)),)
 
 
 def around_robot(name: str, kernel: str | None = None, order: Sequence[int] | None = None, **options: object) -> Case:
@@ -119,7 +119,9 @@ def around_robot(name: str, kernel: str | None = None, order: Sequence[int] | No
 def rigid_body_with_drive(name: str) -> tuple[LinearKernel, ...]:
     """Return the rigid bodies of a robot and friction of all kinds."""
     bodies = rigid_body(name)
-    return bodies, DriveKernel(bodies.n_joints, DRIVE_KINDS, bodies.arm)
+    return bodies, DriveKernel(
+        replace(bodies.arm, drive=DRIVE_KINDS, acceleration=np.full(bodies.n_joints, 3.0)).friction
+    )
 
 
 PANDA = ("revolute",) * 7
@@ -133,7 +135,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "rigid-body": lambda: around_robot("panda"),
     "rigid-body alone, from zero": lambda: case(PANDA, None, (rigid_body("panda", prior="zero", gravity=False),)),
     "rigid-body with friction of slow joints": lambda: case(
-        PANDA, None, (rigid_body("panda"), DriveKernel(7, ("stribeck",)))
+        PANDA, None, (rigid_body("panda"), DriveKernel(Drive(7, ("stribeck",))))
     ),
     "rigid-body with friction of all kinds": lambda: case(PANDA, None, rigid_body_with_drive("panda")),
     "rigid-body and chain": lambda: around_robot("panda", "chain"),
@@ -208,7 +210,7 @@ def test_negative_variance_gives_zero_std() -> None:
 
 def test_threads_get_identical_and_own_predictions() -> None:
     threads, rounds = 4, 30
-    both = case(PANDA, "chain", (rigid_body("panda"), DriveKernel(7)), queries=threads)
+    both = case(PANDA, "chain", (rigid_body("panda"), DriveKernel(Drive(7))), queries=threads)
     evaluator, motions = both.evaluator(), both.query.arrays()
     tau, std, covariance, _ = evaluator.many(*arrays_of(both.query), covariance=True)
     start = Barrier(threads)

@@ -10,9 +10,10 @@ from lipcore import FitOptions, Samples, TorqueModel, load, save
 from lipcore.arm.learning import learn
 from lipcore.data.independence import INDEPENDENT_HZ
 from lipcore.data.metrics import evaluate
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.estimators.task import Task
-from lipcore.kernels.fast.answer import ACCELERATED
+from lipcore.kernels.drive.play import deflections_at
+from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import friction_coefficients
 from lipcore.posterior.misfit import OPTIONS, Misfit, estimate_misfit, low_speed_variance, shared_rows
@@ -56,12 +57,17 @@ def test_residuals_of_any_size_are_accepted() -> None:
         assert np.isfinite([noise, rest]).all()
 
 
-def test_raised_variance_at_rest_is_unchanged_at_its_speed() -> None:
+def at_rest(misfit: Misfit, dq: Array) -> Array:
+    return misfit.at_rest(Motion(np.zeros_like(dq), dq, np.zeros_like(dq)))
+
+
+def test_friction_at_standstill_is_unknown_at_standstill_alone() -> None:
     given = replace(Misfit.none(3), rest=np.array([0.0, 0.01, 4.0]), slow=np.array([0.02, 0.2, 0.2]))
-    raised = given.with_friction(np.full(3, 2.0))
-    np.testing.assert_allclose(raised.rest, [2.0, 2.0, 4.0])
-    np.testing.assert_allclose(raised.slow[[0, 2]], given.slow[[0, 2]])  # not below the width of the sign
-    np.testing.assert_allclose(raised.at_rest(given.slow)[1], given.at_rest(given.slow)[1])
+    raised, still, moving = given.with_friction(np.full(3, 2.0)), np.zeros((1, 3)), np.full((1, 3), 0.2)
+    np.testing.assert_allclose(at_rest(raised, still), [[2.0, 2.0, 4.0]])
+    np.testing.assert_allclose(at_rest(raised, moving), at_rest(given, moving), atol=1e-12)
+    elements = np.ones((2, 5, 3))
+    np.testing.assert_allclose(replace(given, elements=0.2 * elements).with_friction(np.full(3, 2.0)).still[0], 0.5)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5])
@@ -86,7 +92,8 @@ def test_rows_of_one_second_share_lasting_errors() -> None:
     again = Samples.concatenate([samples, samples, samples])  # the same motion, and so the same error, three times
     assert shared_rows(again, TYPES, 600) == pytest.approx(30.0, rel=0.05)
     one, rows = np.ones(2), INDEPENDENT_HZ * OPTIONS.lasting_s
-    counted = Misfit(0.5 * one, one, np.array([0.25, 1.0]), one, one).of_row(one, np.array([[0.0, 3.0]]))
+    zero, moving = np.zeros((1, 2)), np.array([[0.0, 3.0]])
+    counted = Misfit(0.5 * one, one, np.array([0.25, 1.0]), one, one, 0 * one).of_row(one, Motion(zero, moving, zero))
     expected = [0.75 + rows * (0.25 + 0.5), rows * (1.0 + 0.5 * np.exp(-9.0))]
     np.testing.assert_allclose(counted, np.array([expected]))
 
@@ -100,10 +107,13 @@ def test_predictions_include_the_misfit(model: TorqueModel) -> None:
     motion = Motion(np.full((4, 2), 0.3), dq, ddq)
     bare = replace(model, posterior=replace(posterior, misfit=Misfit.none(2)))
     found, without = (each.predict(motion.q, dq, ddq, covariance=True) for each in (model, bare))
-    rest, slow, lasting, speed, acceleration = misfit.packed()
+    rest, slow, lasting, speed, acceleration, stuck = misfit.packed()[:MISFIT_ROWS]
     faster, harder = (np.maximum(np.mean((x / u) ** 2, axis=1) - 1, 0.0) for x, u in ((dq, speed), (ddq, acceleration)))
     faster += ACCELERATED * harder
-    expected = rest * np.exp(-((dq / slow) ** 2)) + lasting * faster[:, None]
+    expected = rest * np.exp(-((dq / slow) ** 2)) + stuck * np.exp(-((dq / 0.02) ** 2)) + lasting * faster[:, None]
+    if (torque := misfit.elements[0]).size:
+        ranges = deflections_at(dq, misfit.elements[1], acceleration)[:, len(torque) :]
+        expected += np.square((torque * ranges).sum(axis=1)) / 3
     np.testing.assert_allclose(found.tau_std**2 - without.tau_std**2, expected, rtol=1e-6, atol=1e-9 * expected.max())
     np.testing.assert_allclose(found.covariance, posterior.predict(motion).covariance, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(model.answer(motion.arrays()[3])[1], found.tau_std[3], rtol=1e-9)
@@ -111,13 +121,14 @@ def test_predictions_include_the_misfit(model: TorqueModel) -> None:
 
 def test_friction_at_rest_may_hold_any_torque(model: TorqueModel) -> None:
     coulomb = friction_coefficients(model.posterior, model.estimator).coulomb
-    assert (model.posterior.misfit.rest >= 0.9 * OPTIONS.rest_share * coulomb**2).all()
+    stated = at_rest(model.posterior.misfit, np.zeros((1, 2)))
+    assert (stated > 0.3 * coulomb**2).all()  # a third, if every torque from −coulomb to coulomb is equally likely
     held = simulate_dirty(7, course="rests", speed=0.5)
     answer = model.predict(held.q, held.dq, held.ddq)
     still = (np.abs(held.dq) < 0.01).all(axis=1)
     assert 100 < still.sum() < len(held)
-    at_rest = evaluate(held.tau[still], answer.tau[still], answer.tau_std[still], answer.noise_std)
-    assert (at_rest.coverage > 0.85).all(), at_rest.coverage
+    found = evaluate(held.tau[still], answer.tau[still], answer.tau_std[still], answer.noise_std)
+    assert (found.coverage > 0.85).all(), found.coverage
 
 
 def test_misfit_is_saved_and_loaded(model: TorqueModel, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from lipcore import FitOptions, NotPositiveDefiniteError, Samples, TorqueModel, 
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import ESTIMATORS, make_estimator
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
-from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.model import dynamics
 from lipcore.model.parameters import weight_posterior
 from lipcore.posterior.basis import Basis
@@ -44,7 +44,7 @@ class Setting(NamedTuple):
 @pytest.fixture(scope="module", params=KERNELS)
 def setting(request: pytest.FixtureRequest) -> Setting:
     problem = random_problem(JOINTS, samples=9, seed=4, kernel=request.param)
-    kernel = SumKernel(problem.kernel, DriveKernel(N_JOINTS))
+    kernel = SumKernel(problem.kernel, DriveKernel(Drive(N_JOINTS)))
     tau = np.random.default_rng(5).normal(size=(9, N_JOINTS))
     query = random_problem(JOINTS, samples=7, seed=6).motion
     return Setting(problem, kernel, tau, query, ExactPosterior.fit(kernel, problem.params, problem.motion, tau))
@@ -115,7 +115,7 @@ def test_gradient_matches_finite_differences(setting, pairs, monkeypatch) -> Non
         # with many chunks the pairs below the diagonal blocks are only counted, not computed
         monkeypatch.setattr("lipcore.kernels.base.PAIRS_PER_CHUNK", pairs)
         energies = TorchForm(setting.problem.kernel)
-    gradient = evidence(setting._replace(kernel=SumKernel(energies, DriveKernel(3)))).gradient
+    gradient = evidence(setting._replace(kernel=SumKernel(energies, DriveKernel(Drive(3))))).gradient
     params = setting.problem.params
     assert gradient.keys() == params.keys()
 

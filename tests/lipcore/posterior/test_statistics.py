@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lipcore import FitCancelledError, FitOptions, Samples, TorqueModel, train
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import SumKernel
-from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.linalg import NotPositiveDefiniteError, eigen
 from lipcore.posterior.statistics import (
@@ -38,7 +38,7 @@ NOISE = np.array([0.04, 0.01, 0.09])
 def random_basis_and_samples(seed: int, samples: int = 12) -> tuple[Basis, Motion, Array]:
     """Return a basis that does not fully cover its samples, and the samples."""
     found = random_problem(TYPES, samples, seed, "chain")
-    kernel = SumKernel(found.kernel, DriveKernel(len(TYPES)))
+    kernel = SumKernel(found.kernel, DriveKernel(Drive(len(TYPES))))
     basis = Basis.build(kernel, found.params, found.motion[:4], np.array([0, 1, 3, 5, 8, 10]))
     return basis, found.motion, np.random.default_rng(seed).standard_normal((samples, len(TYPES)))
 
