@@ -84,17 +84,12 @@ def choose_drive(problem: Problem, point: Point, rows: NDArray[np.int64], stop: 
         if (samples >= OPTIONS.min_samples or len(KIND_TERMS[kind]) == 1) and (remembers or kind != "play")
     ]
     while open_kinds and not stop():
-        trials: list[tuple[float, DriveKind, ScaleFit]] = []
-        for kind in open_kinds:
-            wider = with_kind(best.problem, best.point, kind)
-            trial = rescale(wider, wider.at(point.geometry, point.sigma))
-            trials.append((best.value - trial.value, kind, trial))
-        for nats, kind, trial in sorted(trials, key=lambda each: -each[0]):
-            if nats < _min_nats(kind) or _falls_with_load(trial.problem, trial.point):
-                continue
-            wider_errors = held_out_errors(trial.problem, trial.point, blocks)
-            if _is_better(errors, wider_errors):
-                best, errors, gain = trial, wider_errors, gain + nats
+        trials = [(_fit_kind(best, point, kind), kind) for kind in open_kinds]
+        for trial, kind in sorted(trials, key=lambda each: each[0].value):
+            chosen = _choose_joints(best, trial, point, kind, errors, blocks)
+            if chosen is not None:
+                gain += best.value - chosen.fit.value
+                best, errors = chosen.fit, chosen.errors
                 open_kinds.remove(kind)
                 break
         else:
@@ -102,15 +97,53 @@ def choose_drive(problem: Problem, point: Point, rows: NDArray[np.int64], stop: 
     return DriveChoice(best.problem, best.point, gain)
 
 
+@dataclass(frozen=True)
+class _Chosen:
+    """A kind that is added."""
+
+    fit: ScaleFit
+    errors: Array
+    """Held-out errors, (B, n) (N·m)²."""
+
+
+def _fit_kind(best: ScaleFit, point: Point, kind: DriveKind, joints: NDArray[np.bool_] | None = None) -> ScaleFit:
+    """Return the fit with another kind. joints: (n,), those that have it; None for all."""
+    joints = np.ones(best.problem.n_joints, np.bool_) if joints is None else joints
+    wider = with_kind(best.problem, best.point, kind, joints)
+    return rescale(wider, wider.at(point.geometry, point.sigma))
+
+
+def _choose_joints(
+    best: ScaleFit, trial: ScaleFit, point: Point, kind: DriveKind, errors: Array, blocks: NDArray[np.int64]
+) -> _Chosen | None:
+    """Return the fit with a kind for the joints that are better with it; None if it is to be left out.
+
+    trial: with the kind for all joints; errors: held-out errors without it.
+    """
+    if best.value - trial.value < _min_nats(kind) or _falls_with_load(trial.problem, trial.point):
+        return None
+    wider = held_out_errors(trial.problem, trial.point, blocks)
+    joints = _is_better(errors, wider)
+    if not joints.any():
+        return None
+    if not joints.all():
+        trial = _fit_kind(best, point, kind, joints)
+        wider = held_out_errors(trial.problem, trial.point, blocks)
+    nats = best.value - trial.value
+    if nats < _min_nats(kind) or not _is_better(*(np.exp(np.log(each).mean(axis=1)) for each in (errors, wider))):
+        return None
+    return _Chosen(trial, wider)
+
+
 def _min_nats(kind: DriveKind) -> float:
     """Return the min gain in evidence of a kind."""
     return OPTIONS.min_nats if len(KIND_TERMS[kind]) == 1 else OPTIONS.min_nats_of_several
 
 
-def _is_better(before: Array, after: Array) -> bool:
-    """Return whether held-out errors fall beyond their scatter over the blocks, (B, n) each."""
-    gains = np.log(before / after).mean(axis=1)
-    return bool(gains.mean() > OPTIONS.min_deviations * gains.std(ddof=1) / np.sqrt(len(gains)))
+def _is_better(before: Array, after: Array) -> NDArray[np.bool_]:
+    """Return whether held-out errors of B blocks fall beyond their scatter, (…,) of (B, …)."""
+    gains = np.log(before / after)
+    return np.asarray(gains.mean(axis=0) > OPTIONS.min_deviations * gains.std(axis=0, ddof=1) / np.sqrt(len(gains)))
 
 
 def held_out_errors(problem: Problem, point: Point, blocks: NDArray[np.int64]) -> Array:
@@ -138,4 +171,5 @@ def _falls_with_load(problem: Problem, point: Point) -> bool:
     places = problem.bodies + terms.index("load") + len(terms) * np.arange(problem.n_joints)
     covariance = cho_solve((point.factor, True), np.eye(len(problem.scale)), check_finite=False)
     deviation = np.sqrt(covariance.diagonal()[places])
-    return bool((point.weights[places] < -OPTIONS.max_doubt * deviation).any())
+    used = problem.used[:, terms.index("load")]
+    return bool((point.weights[places] < -OPTIONS.max_doubt * deviation)[used].any())

@@ -93,6 +93,7 @@ def make_problem(
         floor,
         _expected(types, gravity, around),
         drive,
+        np.ones((n, len(BASE_TERMS)), np.bool_),
     )
 
 
@@ -122,10 +123,11 @@ def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -
     return GeometryPrior.anything(any_arm)
 
 
-def with_kind(problem: Problem, point: Point, kind: DriveKind) -> Problem:
+def with_kind(problem: Problem, point: Point, kind: DriveKind, joints: NDArray[np.bool_]) -> Problem:
     """Return the same problem with another kind of friction. The load is that of a point's bodies.
 
-    The prior std of a new term is that of the Coulomb term, for the term's largest size in the samples.
+    joints: (n,), those that have the kind. The prior std of a new term is that of the Coulomb term, for the term's
+    largest size in the samples.
     """
     n, first, before = problem.n_joints, problem.bodies, problem.drive
     kinds, elements = check_kinds((*before.kinds, kind)), before.elements
@@ -136,6 +138,9 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind) -> Problem:
     terms, known = drive.terms, before.terms
     largest = np.abs(drive.by_joint(problem.motions)).max(axis=0)  # (n, f)
     unit, scale = np.empty((2, n, len(terms)))
+    used = np.empty(unit.shape, np.bool_)
+    for place, term in enumerate(terms):
+        used[:, place] = problem.used[:, known.index(term)] if term in known else joints
     for values, old in ((unit, problem.unit), (scale, problem.scale)):
         of_joint = old[first:].reshape(n, -1)
         for place, term in enumerate(terms):
@@ -147,6 +152,7 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind) -> Problem:
         problem,
         friction=drive.features(problem.motions),
         drive=drive,
+        used=used,
         centre=np.concatenate([problem.centre[:first], np.zeros(unit.size)]),
         scale=np.concatenate([problem.scale[:first], scale.reshape(-1)]),
         unit=np.concatenate([problem.unit[:first], unit.reshape(-1)]),

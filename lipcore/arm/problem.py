@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from lipcore.data.motion import Indices
@@ -109,6 +110,8 @@ class Problem:
     """Prior of the geometry, None if it is fixed."""
     drive: Drive
     """Terms of friction, base to tip."""
+    used: NDArray[np.bool_]
+    """Terms that a joint has, (n, f). The coefficients of others are zero."""
     scale_width: float = WIDTHS.scale
     """Prior standard deviation of the parts of the logarithms of s, except those of friction."""
 

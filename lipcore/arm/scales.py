@@ -36,6 +36,8 @@ class ScaleOptions:
     max."""
     min_kind_share: float = 1e-3
     """The same for the kinds of friction that a recording has to support."""
+    unused_share: float = 1e-6
+    """The same for kinds that a joint does not have, and its max."""
     pooling_width: float = 0.7
     """Prior standard deviation of the logarithm of a joint's friction deviation around the mean of all joints."""
     min_count: float = 40.0
@@ -78,13 +80,19 @@ def rescale(problem: Problem, point: Point) -> ScaleFit:
     least = np.full(len(problem.drive.terms), np.log(OPTIONS.min_kind_share))
     least[: len(BASE_TERMS)] = np.log(OPTIONS.min_friction_share)
     bounds = [(-OPTIONS.max_log_share, OPTIONS.max_log_share)] * masses
-    bounds += [(float(each), 0.0) for each in np.tile(least, n)]
+    none, used = float(np.log(OPTIONS.unused_share)), problem.used
+    bounds += [
+        (float(each), 0.0) if there else (none, none)
+        for each, there in zip(np.tile(least, n), used.reshape(-1), strict=True)
+    ]
     width = np.repeat([problem.scale_width, OPTIONS.pooling_width], [masses, frictions])
 
     def negative(shares: Array) -> tuple[float, Array]:
         value, slopes = evidence(parts @ shares)
         friction = shares[masses:].reshape(n, -1)
-        off = np.concatenate([shares[:masses], (friction - friction.mean(0)).reshape(-1)]) / width
+        usual = np.where(used, friction, 0.0).sum(axis=0) / np.maximum(used.sum(axis=0), 1)
+        apart = np.where(used, friction - usual, 0.0)
+        off = np.concatenate([shares[:masses], apart.reshape(-1)]) / width
         return value + 0.5 * float(off @ off), parts.T @ slopes + off / width
 
     start = np.linalg.lstsq(parts, np.log(problem.scale / problem.unit))[0]

@@ -52,8 +52,8 @@ class Motion:
     """N instants of motion of n joints, float64.
 
     q, dq, ddq: (N, n) position, velocity, acceleration in rad, rad/s, rad/s² (prismatic: m, m/s, m/s²). deflections:
-    (N, 2 K, n), of the drive's K play elements: their expected values, then the half widths of the ranges that they lie
-    in (`lipcore.kernels.drive.play`); None if the motion before these instants is unknown.
+    (N, 2 K, n), of the drive's K play elements: their expected values, then their standard deviations
+    (`lipcore.kernels.drive.play`); None if the motion before these instants is unknown.
     """
 
     q: Array

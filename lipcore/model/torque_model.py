@@ -239,8 +239,8 @@ class TorqueModel:
 
         It is meant for control loops.
 
-        motion: q, dq and ddq, and deflections if known, float64 (3, n) or (3 + 2 K, n). Neither shape nor finiteness is checked. Values that are not
-        finite give torques that are not finite.
+        motion: q, dq and ddq, and deflections if known, float64 (3, n) or (3 + 2 K, n). Neither shape nor finiteness is
+        checked. Values that are not finite give torques that are not finite.
         """
         tau, deviation, share = self.evaluator.one(motion, std)
         return tau if share is None else self._harmless(motion, tau, share), deviation

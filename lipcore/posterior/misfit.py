@@ -49,11 +49,11 @@ EARLIER_ROWS = 5
 class Misfit:
     """Variance in addition to noise and posterior, of joints at N velocities dq (eq. 25 of docs/method.md).
 
-        at rest      rest_j exp(−(dq_j / slow_j)²) + still_j exp(−(dq_j / w)²) + ⅓ (Σ_k |f_jk| h_jk)²
+        at rest      rest_j exp(−(dq_j / slow_j)²) + still_j exp(−(dq_j / w)²) + (Σ_k |f_jk| d_jk)²
         faster       lasting_j (max(0, mean_i (dq_i / speed_i)² − 1) + ACCELERATED max(0, mean_i (ddq_i / u_i)² − 1))
 
-    u is `acceleration`, w is SIGN_WIDTH. The variance of faster motion depends on all joints i. h is the half width of
-    the range that a deflection lies in, f the torque of its element.
+    u is `acceleration`, w is SIGN_WIDTH. The variance of faster motion depends on all joints i. d is the standard
+    deviation of an element's deflection, f its torque.
     """
 
     rest: Array
@@ -124,8 +124,8 @@ class Misfit:
         if self.elements.size:
             torque, widths = self.elements
             known = motion.deflections
-            known = deflections_at(motion.dq, widths, self.acceleration) if known is None else known
-            out = out + np.square((torque * known[:, len(widths) :]).sum(axis=1)) / 3
+            known = deflections_at(motion.dq, motion.ddq, widths, self.acceleration) if known is None else known
+            out = out + np.square((torque * known[:, len(widths) :]).sum(axis=1))
         return np.asarray(out)
 
     def variance(self, motion: Motion) -> Array:

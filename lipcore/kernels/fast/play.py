@@ -1,4 +1,4 @@
-"""Deflections of play elements, see `kernels.drive.play`: followed along a motion, or given a velocity alone."""
+"""Deflections of play elements, see `kernels.drive.play`: followed along a motion, or given one instant of it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from lipcore.kernels.fast.compile import compiled, inlined
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+CERTAIN_SHARE = 0.1
+"""Acceleration, as a share of the usual one, above which its direction tells which way a joint turns."""
 POSITIONS = 3
 """Rows of a motion before its deflections: q, dq and ddq."""
 
@@ -37,24 +39,20 @@ def follow(q: Array, fresh: Flags, widths: Array, bounds: Array, last: Array, ou
 
 
 @inlined
-def known_share(velocity: float, width: float, acceleration: float) -> float:
-    """Return the share of an element's range that the stroke since standstill has excluded, 0 to 1."""
-    return min(velocity * velocity / (4.0 * acceleration * width), 1.0)
-
-
-@inlined
 def expected_deflection(motion: Array, joint: int, k: int, elements: Array) -> float:
     """Return the expected deflection of an element. elements: (K + 1, n), widths and usual acceleration."""
     if motion.shape[0] > POSITIONS:
         return motion[POSITIONS + k, joint]
-    velocity, last = motion[1, joint], elements.shape[0] - 1
-    share = known_share(velocity, elements[k, joint], elements[last, joint])
-    return share if velocity > 0.0 else -share
+    velocity, pushed = motion[1, joint], motion[2, joint]
+    size = np.hypot(pushed, CERTAIN_SHARE * elements[elements.shape[0] - 1, joint])
+    stroke = 0.5 * velocity * abs(velocity) / (size * elements[k, joint])
+    return min(max(stroke - pushed / size, -1.0), 1.0)
 
 
 @inlined
-def half_range(motion: Array, joint: int, k: int, count: int, width: float, acceleration: float) -> float:
-    """Return the half width of the range of an element's deflection, 0 to 1. count: number of elements."""
+def deflection_std(motion: Array, joint: int, k: int, count: int, width: float, acceleration: float) -> float:
+    """Return the standard deviation of an element's deflection, 0 to 1. count: number of elements."""
     if motion.shape[0] > POSITIONS:
         return motion[POSITIONS + count + k, joint]
-    return 1.0 - known_share(motion[1, joint], width, acceleration)
+    size = np.hypot(motion[2, joint], CERTAIN_SHARE * acceleration)
+    return np.exp(-0.25 * motion[1, joint] ** 2 / (size * width))

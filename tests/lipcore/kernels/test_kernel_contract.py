@@ -90,7 +90,7 @@ def drive_terms_of(arm: Arm, kinds: Sequence[DriveKind], motion: Motion) -> Arra
     """Return the terms of friction with the torque of an arm's bodies as the load, (f, N, n)."""
     load, known = np.abs(bodies_torque(arm.geometry, arm.order, arm.parameters, motion)), motion.deflections
     if known is None:
-        known = deflections_at(motion.dq, element_widths(arm.joint_types), arm.acceleration)
+        known = deflections_at(motion.dq, motion.ddq, element_widths(arm.joint_types), arm.acceleration)
     return drive_features(motion.dq, kinds, load, known[:, : len(ELEMENTS)])
 
 

@@ -112,8 +112,8 @@ def test_predictions_include_the_misfit(model: TorqueModel) -> None:
     faster += ACCELERATED * harder
     expected = rest * np.exp(-((dq / slow) ** 2)) + stuck * np.exp(-((dq / 0.02) ** 2)) + lasting * faster[:, None]
     if (torque := misfit.elements[0]).size:
-        ranges = deflections_at(dq, misfit.elements[1], acceleration)[:, len(torque) :]
-        expected += np.square((torque * ranges).sum(axis=1)) / 3
+        spread = deflections_at(dq, ddq, misfit.elements[1], acceleration)[:, len(torque) :]
+        expected += np.square((torque * spread).sum(axis=1))
     np.testing.assert_allclose(found.tau_std**2 - without.tau_std**2, expected, rtol=1e-6, atol=1e-9 * expected.max())
     np.testing.assert_allclose(found.covariance, posterior.predict(motion).covariance, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(model.answer(motion.arrays()[3])[1], found.tau_std[3], rtol=1e-9)
