@@ -3,7 +3,8 @@
 Kinds of several terms need ten seconds of motion. Kinds are added one after another. Each time the kind with the
 largest gain in evidence is added, if
 
-- it gains at least `min_nats`, with several terms `min_nats_of_several`, and
+- it gains at least `min_nats`, with several terms `min_nats_of_several`, for all joints or for those that are predicted
+  better with it, and
 - blocks of the recording are predicted better from the other blocks, beyond their scatter, and
 - friction does not fall with the load, beyond doubt.
 
@@ -86,6 +87,8 @@ def choose_drive(problem: Problem, point: Point, rows: NDArray[np.int64], stop: 
     while open_kinds and not stop():
         trials = [(_fit_kind(best, point, kind), kind) for kind in open_kinds]
         for trial, kind in sorted(trials, key=lambda each: each[0].value):
+            if best.value - trial.value < 0:
+                break
             chosen = _choose_joints(best, trial, point, kind, errors, blocks)
             if chosen is not None:
                 gain += best.value - chosen.fit.value
@@ -116,23 +119,20 @@ def _fit_kind(best: ScaleFit, point: Point, kind: DriveKind, joints: NDArray[np.
 def _choose_joints(
     best: ScaleFit, trial: ScaleFit, point: Point, kind: DriveKind, errors: Array, blocks: NDArray[np.int64]
 ) -> _Chosen | None:
-    """Return the fit with a kind for the joints that are better with it; None if it is to be left out.
+    """Return the fit with a kind; None if it is to be left out.
 
-    trial: with the kind for all joints; errors: held-out errors without it.
+    The joints have it that are predicted better with it, or all if that has the higher evidence. trial: with the kind
+    for all joints; errors: held-out errors without it.
     """
-    if best.value - trial.value < _min_nats(kind) or _falls_with_load(trial.problem, trial.point):
-        return None
     wider = held_out_errors(trial.problem, trial.point, blocks)
     joints = _is_better(errors, wider)
-    if not joints.any():
-        return None
-    if not joints.all():
-        trial = _fit_kind(best, point, kind, joints)
-        wider = held_out_errors(trial.problem, trial.point, blocks)
-    nats = best.value - trial.value
-    if nats < _min_nats(kind) or not _is_better(*(np.exp(np.log(each).mean(axis=1)) for each in (errors, wider))):
-        return None
-    return _Chosen(trial, wider)
+    if joints.any() and not joints.all():
+        fewer = _fit_kind(best, point, kind, joints)
+        if fewer.value < trial.value:
+            trial, wider = fewer, held_out_errors(fewer.problem, fewer.point, blocks)
+    supported = best.value - trial.value >= _min_nats(kind) and not _falls_with_load(trial.problem, trial.point)
+    both = (np.exp(np.log(each).mean(axis=1)) for each in (errors, wider))
+    return _Chosen(trial, wider) if supported and _is_better(*both) else None
 
 
 def _min_nats(kind: DriveKind) -> float:

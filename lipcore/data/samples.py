@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
@@ -87,6 +88,16 @@ class Samples:
             episodes.append(numbered)
             used = int(numbered.max()) + 1
         stack = {k: np.concatenate([getattr(p, k) for p in parts]) for k in ("t", "q", "dq", "ddq", "tau")}
-        known = [part.deflections for part in parts if part.deflections is not None]
-        deflections = np.concatenate(known) if len(known) == len(parts) else None
+        deflections = joined_deflections([part.deflections for part in parts], [len(part) for part in parts])
         return Samples(joint_names=names, episode=np.concatenate(episodes), deflections=deflections, **stack)
+
+
+def joined_deflections(parts: Sequence[Array | None], rows: Sequence[int]) -> Array | None:
+    """Return the deflections of several parts, as in `Motion`; None if all are unknown. rows: of each part."""
+    known = next((part for part in parts if part is not None), None)
+    if known is None:
+        return None
+    unknown = np.repeat([0.0, 1.0], known.shape[1] // 2)[None, :, None] * np.ones((1, 1, known.shape[2]))
+    return np.concatenate(
+        [np.repeat(unknown, count, axis=0) if part is None else part for part, count in zip(parts, rows, strict=True)]
+    )

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
-from lipcore.data.samples import Array
+from lipcore.data.samples import Array, joined_deflections
+from lipcore.kernels.drive.play import PlayState
 from lipcore.vocabulary import CODES, Code
 
 AHEAD_S = 1.0
@@ -21,7 +22,8 @@ AHEAD_S = 1.0
 class Rows:
     """N rows of n joints. time: (N,) event time, s; q, dq, ddq, tau: (N, n), SI; code: (N,) uint8 places in CODES.
 
-    weight: (N,) effective samples of each row (see `data.independence`), one by default.
+    weight: (N,) effective samples of each row (see `data.independence`), one by default. deflections: (N, 2 K, n), see
+    `Motion`, of play elements with these widths, (K, n); both None if the motion before is unknown.
     """
 
     time: Array
@@ -31,6 +33,8 @@ class Rows:
     tau: Array
     code: NDArray[np.uint8]
     weight: Array = field(default_factory=lambda: np.empty(0))
+    deflections: Array | None = None
+    widths: Array | None = None
 
     def __post_init__(self) -> None:
         if not len(self.weight):
@@ -49,7 +53,9 @@ class Rows:
 
     def take(self, index: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Rows:
         """Return the chosen rows."""
-        return Rows(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        deflections = None if self.deflections is None else self.deflections[index]
+        arrays = {name: getattr(self, name)[index] for name in ARRAYS}
+        return Rows(**arrays, deflections=deflections, widths=self.widths)
 
     @property
     def learnt(self) -> Rows:
@@ -58,8 +64,13 @@ class Rows:
         return self if teaches.all() else self.take(teaches)
 
     def motion(self) -> Motion:
-        """Return position, velocity and acceleration; raise ValueError if one is not finite."""
-        return Motion.from_arrays(self.q, self.dq, self.ddq)
+        """Return the motion; raise ValueError if a number of q, dq or ddq is not finite."""
+        return replace(Motion.from_arrays(self.q, self.dq, self.ddq), deflections=self.deflections)
+
+    def followed(self, before: PlayState, widths: Array) -> tuple[Rows, PlayState]:
+        """Return the rows with their deflections, and the state after them. before: state before the first row."""
+        deflections, after = before.follow(self.time, self.q, self.dq, widths)
+        return replace(self, deflections=deflections, widths=widths), after
 
     def rejected(self) -> dict[str, int]:
         """Return the number of rows per code other than `learnt`, without zeros."""
@@ -69,7 +80,14 @@ class Rows:
     @staticmethod
     def concatenate(parts: Sequence[Rows]) -> Rows:
         """Return the rows of all parts in order."""
-        return Rows(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Rows)})
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
+        deflections = joined_deflections([part.deflections for part in parts], [len(part) for part in parts])
+        widths = next((part.widths for part in parts if part.widths is not None), None)
+        return Rows(**arrays, deflections=deflections, widths=widths)
+
+
+ARRAYS = ("time", "q", "dq", "ddq", "tau", "code", "weight")
+"""Fields of `Rows` that have one entry a row in any case."""
 
 
 @dataclass(frozen=True)

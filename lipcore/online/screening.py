@@ -194,5 +194,5 @@ def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:
     only if innovations are linear in the torque.
     """
     evaluator = model.evaluator.revised(model.evaluator.packed, np.zeros(model.n_joints))
-    mean, std, *_ = evaluator.many(rows.q, rows.dq, rows.ddq)
+    mean, std, *_ = evaluator.many(rows.q, rows.dq, rows.ddq, deflections=rows.deflections)
     return mean, std

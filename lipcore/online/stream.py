@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.kernels.drive.play import PlayState
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
@@ -78,6 +79,8 @@ class StreamRecord:
     """Whether its clock has jumped ahead of the arrival of its rows."""
     begun: int = 0
     """Number of the event of its first batch."""
+    play: PlayState | None = None
+    """The deflections after its last row; None if they are unknown."""
     received: float = 0.0
     """When the last batch arrived, Unix time, s."""
 
@@ -92,6 +95,7 @@ class StreamRecord:
             "payload": None if self.payload is None else self.payload.to_json(),
             "leapt": self.leapt,
             "begun": self.begun,
+            "play": None if self.play is None else self.play.to_json(),
         }
 
     def decided(self) -> StreamRecord:
@@ -108,7 +112,7 @@ class StreamRecord:
         """Read what `to_json` returned, or None, which an earlier release has stored."""
         if values is None:
             return cls(received=received)
-        opening, scale, payload = (values[name] for name in ("opening", "scale", "payload"))
+        opening, scale, payload, play = (values.get(name) for name in ("opening", "scale", "payload", "play"))
         return cls(
             ContactGate.from_json(values["gate"]),
             None if opening is None else Opening.from_json(opening),
@@ -117,5 +121,6 @@ class StreamRecord:
             None if payload is None else PayloadRecord(**payload),
             values["leapt"],
             values["begun"],
+            None if play is None else PlayState.from_json(play),
             received,
         )

@@ -128,9 +128,18 @@ def existing(session: Session, dataset: str) -> DatasetRow:
     return rows[0]
 
 
-def samples(files: Files, row: DatasetRow, most: int | None = None, part: PartOf | None = None) -> Samples:
-    """Read samples of a data set, evenly thinned to at most `most`; raise DamagedDataError."""
-    return files.read_samples(row.id, row.joint_names, row.sha256, most, part)
+def samples(
+    files: Files,
+    row: DatasetRow,
+    most: int | None = None,
+    part: PartOf | None = None,
+    joint_types: Sequence[str] | None = None,
+) -> Samples:
+    """Read samples of a data set, evenly thinned to at most `most`; raise DamagedDataError.
+
+    joint_types: to include deflections; None for none.
+    """
+    return files.read_samples(row.id, row.joint_names, row.sha256, most, part, joint_types)
 
 
 def preview(storage: Storage, dataset: str, quantities: Sequence[str], points: int) -> Preview:

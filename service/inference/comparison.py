@@ -73,8 +73,7 @@ def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) 
 
 
 def _answer(served: ServedModel, samples: Samples) -> TorqueDistribution:
-    answer = served.model.predict(samples.q, samples.dq, samples.ddq)
-    return answer.interval
+    return served.model.predict_along(samples).interval
 
 
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:

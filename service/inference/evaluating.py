@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
 from lipcore.profiles import profile, recognise
@@ -50,7 +49,7 @@ def read_dataset(loaded: LoadedModels, dataset: str, *versions: ServedModel) -> 
     Raise NotFoundError, or InvalidRequestError if the joints differ.
     """
     row = find_dataset(loaded, dataset, *versions)
-    used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES)
+    used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES, joint_types=versions[0].model.joint_types)
     return EvaluationData(row.id, row.sha256, row.rows, used)
 
 
@@ -62,7 +61,7 @@ def read_held_out(loaded: LoadedModels, dataset: str, served: ServedModel) -> Ev
     row = find_dataset(loaded, dataset, served)
     with _splitting():
         split = _split_of(loaded, row, served)
-        used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES, split.held_out)
+        used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES, split.held_out, served.model.joint_types)
     return EvaluationData(row.id, row.sha256, split.rows, used)
 
 
@@ -146,7 +145,7 @@ def _compared(
     """Return the fields of an `Evaluation` of a version."""
     recorded = (read_dataset if request.part == "all" else read_held_out)(loaded, request.dataset, served)
     used = recorded.used
-    answer = served.model.predict(used.q, used.dq, used.ddq)
+    answer = served.model.predict_along(used)
     repeats = _repeats(loaded, served, used, in_training)
     return {"samples": recorded.samples, **evaluation(used, answer.interval), **repeats}
 
@@ -208,7 +207,9 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
     chosen = _within(part, request, len(t))
     rows = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), request.points)).round().astype(np.int64)]
     samples = Samples(served.model.joint_names, **sample_file.read(path, rows))
-    predicted = served.model.predict(samples.q, samples.dq, samples.ddq)
+    deflections = sample_file.follow(sample_file.Reader(path), rows, served.model.joint_types)
+    samples = replace(samples, deflections=deflections)
+    predicted = served.model.predict_along(samples)
     return schema.TraceResponse(
         model=served.name,
         version=served.version,
@@ -265,7 +266,7 @@ def _components(
     std: dict[schema.TraceComponent, list[Array]] = {name: [] for name in names}
     for first in range(0, len(samples), batch):
         some = samples.rows(slice(first, first + batch))
-        estimates = dynamics.components(served.model, Motion.from_arrays(some.q, some.dq, some.ddq), names)
+        estimates = dynamics.components(served.model, some.motion(), names)
         for name in names:
             mean[name].append(estimates[name].mean)
             std[name].append(estimates[name].std)

@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 from sqlalchemy import Select, bindparam, func, select
 from sqlalchemy.orm import Session, undefer
 
 from lipcore.data.samples import Array
-from lipcore.online.batch import AHEAD_S, Placement, Rows
+from lipcore.kernels.drive.play import PlayState
+from lipcore.online.batch import AHEAD_S, ARRAYS, Placement, Rows
 from lipcore.vocabulary import Code
 from service.journal.arrivals import NewBatch, note_arrival
 from service.storage.database import EventRow, LearnerRow, LearningRow, StreamRow, fetch
@@ -28,8 +30,9 @@ from service.storage.rows import read_page as newest_rows
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]
 UNTIMED_CODES = [Code.NON_FINITE, Code.TIME_JUMP]
 """Codes of rows with an invalid time."""
-ARRAY_NAMES = tuple(field.name for field in fields(Rows))
-"""Names of the arrays in the safetensors archive of an event's rows."""
+WIDTHS, FIRST, DEFLECTIONS = "play/widths", "play/first", "play/deflections"
+"""Arrays of the deflections in the safetensors archive of an event's rows: those of the first finite row, from which
+the others follow, or those of every row."""
 
 
 _OF_STREAM = select(EventRow).where(EventRow.model == bindparam("model"), EventRow.stream_id == bindparam("stream_id"))
@@ -276,8 +279,8 @@ def count_pending(session: Session, model: str, after: int) -> tuple[int, float 
 
 
 def encode(rows: Rows) -> bytes:
-    """Return rows as safetensors, bit for bit."""
-    return save({name: np.ascontiguousarray(getattr(rows, name)) for name in ARRAY_NAMES})
+    """Return rows as safetensors; `decode` returns the same rows, bit for bit."""
+    return save({name: np.ascontiguousarray(each) for name, each in _arrays(rows).items()})
 
 
 def decode(data: bytes) -> Rows:
@@ -286,9 +289,36 @@ def decode(data: bytes) -> Rows:
         arrays = load(data)
     except SafetensorError as error:
         raise ValueError(f"logged rows cannot be read: {error}") from None
-    if sorted(arrays) != sorted(ARRAY_NAMES):
-        raise ValueError(f"logged rows have the arrays {', '.join(sorted(arrays))}, expected {', '.join(ARRAY_NAMES)}")
-    return Rows(**arrays)
+    known = set(arrays) - {WIDTHS, FIRST, DEFLECTIONS}
+    if known != set(ARRAYS):
+        raise ValueError(f"logged rows have the arrays {', '.join(sorted(arrays))}, expected {', '.join(ARRAYS)}")
+    own = {name: arrays[name] for name in ARRAYS}
+    rows = Rows(**own, deflections=arrays.get(DEFLECTIONS), widths=arrays.get(WIDTHS))
+    return rows if FIRST not in arrays else follow_first(rows, arrays[FIRST], arrays[WIDTHS])
+
+
+def follow_first(rows: Rows, deflections: Array, widths: Array) -> Rows:
+    """Return rows with the deflections that follow from those of the first finite row, (2 K, n)."""
+    first = _first_finite(rows)
+    return rows.followed(PlayState.at(float(rows.time[first]), rows.q[first], rows.dq[first], deflections), widths)[0]
+
+
+def _first_finite(rows: Rows) -> int:
+    """Return the place of the first row with finite time, position and velocity; 0 if there is none."""
+    numbers = np.hstack([rows.time[:, None], rows.q, rows.dq])
+    return int(np.isfinite(numbers).all(axis=1).argmax())
+
+
+def _arrays(rows: Rows) -> dict[str, NDArray[Any]]:
+    own = {name: getattr(rows, name) for name in ARRAYS}
+    if rows.deflections is None or rows.widths is None:
+        return own
+    first = rows.deflections[_first_finite(rows)]
+    followed = follow_first(rows, first, rows.widths).deflections
+    # rows that were taken from a batch do not follow from their first
+    if followed is not None and np.array_equal(followed, rows.deflections):
+        return {**own, WIDTHS: rows.widths, FIRST: first}
+    return {**own, WIDTHS: rows.widths, DEFLECTIONS: rows.deflections}
 
 
 def _of_stream(model: str, stream_id: str) -> Select[EventRow]:

@@ -8,13 +8,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import safe_open
+
+from lipcore.kernels.drive.play import PlayState, element_widths
 
 ARRAYS = ("t", "episode", "q", "dq", "ddq", "tau")
 CHUNK_ROWS = 1 << 14
@@ -128,6 +130,24 @@ class Reader:
                 parts[name].append(self.array(name, first, last)[index[at:to] - first])
             at = to
         return {name: np.concatenate(arrays) if arrays else self.array(name, 0, 0) for name, arrays in parts.items()}
+
+
+def follow(reader: Reader, index: NDArray[np.int64], joint_types: Sequence[str]) -> NDArray[np.float64]:
+    """Return the deflections at chosen rows (K,) in rising order, as in `Motion`, from the rows before them.
+
+    They are followed from CHUNK_ROWS before the first chosen row.
+    """
+    widths = element_widths(joint_types)
+    state, before, parts = PlayState.unknown(widths.shape[1]), -1, [np.empty((0, 2 * len(widths), widths.shape[1]))]
+    start, stop = (max(0, int(index[0]) - CHUNK_ROWS), int(index[-1]) + 1) if len(index) else (0, 0)
+    for first in range(start, stop, CHUNK_ROWS):
+        last = min(first + CHUNK_ROWS, stop)
+        t, episode, q, dq = (reader.array(name, first, last) for name in ("t", "episode", "q", "dq"))
+        begins = np.diff(episode, prepend=before) != 0
+        deflections, state = state.follow(t, q, dq, widths, begins)
+        before = int(episode[-1])
+        parts.append(deflections[index[(index >= first) & (index < last)] - first])
+    return np.concatenate(parts)
 
 
 def _shape(name: str, rows: int, n_joints: int) -> list[int]:

@@ -112,7 +112,7 @@ def load_datasets(database: Database, files: Files, request: dict[str, Any]) -> 
     with database.session() as session:
         known = refresh_data.datasets(session, request["datasets"])
     rows = [known[name] for name in request["datasets"]]
-    parts = open_parts(files, rows)
+    parts = open_parts(files, rows, request["joint_types"])
     asked = request.get("holdout")
     splits = DatasetSplits([None] * len(parts), [None] * len(parts), None)
     if asked is not None:
@@ -163,7 +163,7 @@ def load_refresh_data(database: Database, files: Files, model: str, request: dic
         return refresh_data.read_log(database, model, base.joint_names, scope, most, MAX_GAP_S, above)
 
     logged = judged = read(within, MAX_REFRESH_SAMPLES)
-    parts = open_parts(files, rows)
+    parts = open_parts(files, rows, base.joint_types)
     splits = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
     corrupt = [find_corrupt_rows(part) for part in parts]
     parts = [replace(part, factor=_aged(part.row, within)) for part in parts]

@@ -153,7 +153,8 @@ def read_log(
     rows, source = rows.take(order), source[order]
     breaks = (np.diff(source) != 0) | (np.diff(rows.time) > longest_step)
     episode = np.concatenate([[0], np.cumsum(breaks)]).astype(np.int64)
-    return LoggedSamples(Samples(joint_names, rows.time, episode, rows.q, rows.dq, rows.ddq, rows.tau), count)
+    found = Samples(joint_names, rows.time, episode, rows.q, rows.dq, rows.ddq, rows.tau, rows.deflections)
+    return LoggedSamples(found, count)
 
 
 def age_weights(times: Array, scope: Scope) -> Array | None:

@@ -25,11 +25,11 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.statistics import empty
 from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import ShardStatistics, sum_samples, with_statistics
-from lipcore.vocabulary import Device
+from lipcore.vocabulary import Device, JointType
 from service.foundation.settings import Settings
 from service.runtime.executors import choose_settings, settings_to_send, shard_executor, sum_shards
 from service.storage.files import PATIENCE_S, Files
-from service.storage.sample_file import Reader
+from service.storage.sample_file import Reader, follow
 from service.training.table import Shard, Table
 
 Made = TypeVar("Made")
@@ -44,6 +44,7 @@ class Context:
     model: dict[str, bytes]
     """Packed files of the model."""
     joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
     device: Device
     """Device to compute on."""
 
@@ -68,7 +69,9 @@ def all_rows(
     shards = table.shards()
     if shards:
         progress(0.0)
-        context = Context(settings_to_send(settings), packed(model), model.joint_names, "cuda" if gpu else "cpu")
+        context = Context(
+            settings_to_send(settings), packed(model), model.joint_names, model.joint_types, "cuda" if gpu else "cpu"
+        )
         with shard_executor(settings, gpu) as executor:
             work = partial(shard_statistics, context)
             share = len(table) / rows / len(shards)
@@ -84,11 +87,13 @@ def shard_statistics(context: Context, shard: Shard) -> ShardStatistics:
     """Return the statistics of one shard's rows; runs in a worker."""
     name = hashlib.sha256(b"".join(context.model.values())).hexdigest() + context.device
     summing = _cached(_SUMMING, name, 2, lambda: _summing(context))
-    samples, weights = read(choose_settings(context.settings), context.joint_names, shard)
+    samples, weights = read(choose_settings(context.settings), context.joint_names, context.joint_types, shard)
     return sum_samples(summing, samples, weights)
 
 
-def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tuple[Samples, Array]:
+def read(
+    settings: Settings, joint_names: tuple[str, ...], joint_types: tuple[JointType, ...], shard: Shard
+) -> tuple[Samples, Array]:
     """Return the selected rows of a shard and their weights, (N,)."""
 
     def opened() -> Reader:
@@ -104,7 +109,8 @@ def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tupl
         weights *= independence.recording_weights(values["t"], values["episode"])[rows]
     values = {name: each[rows] for name, each in values.items()}
     values |= {name: reader.array(name, shard.first, shard.last) for name in ("q", "dq", "ddq", "tau")}
-    samples = Samples(joint_names=joint_names, **values)
+    deflections = follow(reader, np.arange(shard.first, shard.last), joint_types)
+    samples = Samples(joint_names=joint_names, deflections=deflections, **values)
     return (samples, weights) if mask is None else (samples.rows(mask), weights[mask])
 
 

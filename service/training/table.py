@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lipcore.data import independence
-from lipcore.data.samples import Samples
+from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask, Numbers
 from lipcore.training.conditioning import SHARD
+from lipcore.vocabulary import JointType
 from service.storage.database import DatasetRow
 from service.storage.files import Files
-from service.storage.sample_file import Reader
+from service.storage.sample_file import Reader, follow
 from service.training.holding_out import RowTimes
 
 STRETCHES, STRETCH = 40, 500
@@ -56,6 +57,8 @@ class TablePart:
     """Mask of the selected rows, (rows,); None means all."""
     factor: float = 1.0
     """Weight of each row."""
+    joint_types: tuple[JointType, ...] | None = None
+    """Types of the joints, to include deflections in samples; None for none."""
 
     def __len__(self) -> int:
         return self.reader.rows if self.chosen is None else int(np.count_nonzero(self.chosen))
@@ -76,7 +79,9 @@ class TablePart:
         episode = values.pop("episode")
         begins = (np.diff(index) > 1) | (np.diff(episode) != 0)
         numbered = np.concatenate([np.zeros(min(1, len(index)), np.int64), np.cumsum(begins, dtype=np.int64)])
-        return Samples(joint_names=tuple(self.row.joint_names), episode=numbered, **values)
+        return Samples(
+            joint_names=tuple(self.row.joint_names), episode=numbered, deflections=self._deflections(index), **values
+        )
 
     def motion(self, most: int) -> tuple[Numbers, Samples]:
         """Return at most `most` selected rows in order of episode and time, and their indices in that order.
@@ -89,7 +94,13 @@ class TablePart:
         places = np.linspace(0, len(order) - 1, min(len(order), most)).round().astype(np.int64)
         index, back = np.unique(order[places], return_inverse=True)
         values = {name: array[back] for name, array in self.reader.take(index).items()}
+        deflections = self._deflections(index)
+        if deflections is not None:
+            values["deflections"] = deflections[back]
         return places, Samples(joint_names=tuple(self.row.joint_names), **values)
+
+    def _deflections(self, index: Numbers) -> Array | None:
+        return None if self.joint_types is None else follow(self.reader, index, self.joint_types)
 
     def independent_rows(self) -> float:
         """Return the number of effective samples of its rows."""
@@ -166,6 +177,10 @@ class Table:
         return [shard for part in self.parts for shard in part.shards()]
 
 
-def open_parts(files: Files, rows: Sequence[DatasetRow]) -> list[TablePart]:
-    """Return whole data sets as table parts; raise DamagedDataError."""
-    return [TablePart(row, Reader(files.samples_file(row.id, row.sha256))) for row in rows]
+def open_parts(
+    files: Files, rows: Sequence[DatasetRow], joint_types: Sequence[JointType] | None = None
+) -> list[TablePart]:
+    """Return whole data sets as table parts; raise DamagedDataError. joint_types: see `TablePart`."""
+    types = None if joint_types is None else tuple(joint_types)
+    readers = [Reader(files.samples_file(row.id, row.sha256)) for row in rows]
+    return [TablePart(row, reader, joint_types=types) for row, reader in zip(rows, readers, strict=True)]

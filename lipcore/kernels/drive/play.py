@@ -5,9 +5,9 @@ slip). Its deflection e, in units of r, follows the position:
 
     e ← clip(e + Δq / r, −1, 1)
 
-After a stroke of 2 r in one direction e is ±1, wherever it was before. Until then it lies between two bounds that follow
-the same rule and begin at −1 and 1. The expected deflection is their middle. Its standard deviation is half of their
-distance: a joint that has stopped may have slipped in either direction.
+After a stroke of 2 r in one direction e is ±1, wherever it was before. Until then it lies between two bounds that
+follow the same rule and begin at −1 and 1. The expected deflection is their middle. Its standard deviation is half of
+their distance: a joint that has stopped may have slipped in either direction.
 
 If one instant alone is known, its velocity v and acceleration a tell where the joint comes from. With the usual
 acceleration u and A² = a² + (0.1 u)²,
@@ -21,8 +21,9 @@ deviate from this by at most 1.0 times as much for |s| < 2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,30 +66,50 @@ class PlayState:
         bounds = np.stack([np.full((len(ELEMENTS), n), each) for each in (-1.0, 1.0)])
         return cls(bounds, np.zeros(n), np.zeros(n), -np.inf)
 
+    @classmethod
+    def at(cls, time: float, q: Array, dq: Array, deflections: Array) -> PlayState:
+        """Return the state at one instant. q, dq: (n,); deflections: (2 K, n), as in `Motion`."""
+        expected, std = np.split(deflections, 2)
+        return cls(np.stack([expected - std, expected + std]), q.copy(), dq.copy(), time)
+
     def follow(
         self, time: Array, q: Array, dq: Array, widths: Array, begins: NDArray[np.bool_] | None = None
     ) -> tuple[Array, PlayState]:
         """Return the deflections along N instants, (N, 2 K, n) as in `Motion`, and the state after them.
 
-        The motion before an instant is unknown after a gap, or after a step that its velocities do not explain. time:
-        (N,) s; q, dq: (N, n); begins: (N,), instants that begin another motion.
+        The motion before an instant is unknown after a gap, or after a step that its velocities do not explain.
+        Instants with a number that is not finite are left out. time: (N,) s; q, dq: (N, n); begins: (N,), instants that
+        begin another motion.
         """
+        finite = np.isfinite(time) & np.isfinite(q).all(axis=1) & np.isfinite(dq).all(axis=1)
+        if not finite.all():
+            out = np.repeat([0.0, 1.0], len(widths))[None, :, None] * np.ones((len(q), 1, q.shape[1]))
+            kept = None if begins is None else begins[finite]
+            out[finite], after = self.follow(time[finite], q[finite], dq[finite], widths, kept)
+            return out, after
         out = np.empty((len(q), 2 * len(widths), q.shape[1]))
         if not len(q):
             return out, self
-        before = [
-            np.concatenate([last, now])
-            for last, now in (([self.time], time[:-1]), (self.q[None], q[:-1]), (self.dq[None], dq[:-1]))
-        ]
-        elapsed = time - before[0]
+        elapsed = np.diff(time, prepend=self.time)
         fresh = ~((elapsed >= 0) & (elapsed <= MAX_GAP_S))
-        moved = 0.5 * (dq + before[2]) * np.where(fresh, 0.0, elapsed)[:, None]
-        fresh |= (np.abs(q - before[1] - moved) > widths.max(axis=0)).any(axis=1)
+        usual = 0.5 * (dq + np.concatenate([self.dq[None], dq[:-1]])) * np.where(fresh, 0.0, elapsed)[:, None]
+        moved = np.diff(q, axis=0, prepend=self.q[None])
+        fresh |= (np.abs(moved - usual) > widths.max(axis=0)).any(axis=1)
         if begins is not None:
             fresh |= begins
         bounds, last = self.bounds.copy(), self.q.copy()
         follow(np.ascontiguousarray(q, np.float64), fresh, widths, bounds, last, out)
         return out, PlayState(bounds, last, dq[-1].copy(), float(time[-1]))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as numbers and lists; `from_json` restores them to the last bit."""
+        return {"bounds": self.bounds.tolist(), "q": self.q.tolist(), "dq": self.dq.tolist(), "time": self.time}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> PlayState:
+        """Read what `to_json` returned."""
+        bounds, q, dq = (np.array(values[name], np.float64) for name in ("bounds", "q", "dq"))
+        return cls(bounds, q, dq, float(values["time"]))
 
 
 def with_deflections(samples: Samples, joint_types: Sequence[str]) -> Samples:

@@ -13,6 +13,7 @@ import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.kernels.drive.play import PlayState, element_widths
 from lipcore.online.batch import Placement, Rows
 from lipcore.online.judging import Judgement, JudgeOptions, judge
 from lipcore.online.screening import PredictedBatch
@@ -29,7 +30,7 @@ from service.learning.ingest.monitor import Monitor
 from service.learning.weigher.weighing import Weighing
 from service.models import registry
 from service.models.loaded import LoadedModels, ServedModel
-from service.storage.database import EventRow, ModelRow
+from service.storage.database import EventRow, ModelRow, StreamRow
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +66,15 @@ class Arrival(NamedTuple):
     """The quantities that were derived; None if all were measured."""
     leap: float | None = None
     """Seconds that the stream's clock has leapt ahead; None if it has not."""
+    play: PlayState | None = None
+    """The deflections after its last row; None if later rows of the stream have arrived before."""
+
+
+class FollowedRows(NamedTuple):
+    """Rows with their deflections. play: those after the last row; None for late rows."""
+
+    rows: Rows
+    play: PlayState | None
 
 
 class ObservationLog:
@@ -174,6 +184,20 @@ class ObservationLog:
                 logger.error("could not delete old batches from the log of model %s", model, exc_info=error)
 
 
+def follow_rows(
+    monitor: Monitor, served: ServedModel, stream_id: str, source: StreamRow | None, sequence: int, rows: Rows
+) -> FollowedRows:
+    """Return rows with the deflections that follow from the stream's earlier rows. In a `turn` of the model.
+
+    The motion before late rows is unknown. source: row of the stream, None if it is new; sequence: of the first row.
+    """
+    late = source is not None and sequence <= source.last
+    before = None if source is None or late else monitor.streams.get(stream_id).play
+    state = PlayState.unknown(served.model.n_joints) if before is None else before
+    followed, after = rows.followed(state, element_widths(served.model.joint_types))
+    return FollowedRows(followed, None if late else after)
+
+
 def _judge_options(options: LearningOptions) -> JudgeOptions:
     return JudgeOptions(options.enabled, options.on_change, options.contact_threshold, options.adaptive_intervals)
 
@@ -207,7 +231,8 @@ def _write(
     if arrival.leap is not None and not before.leapt:
         consequences.raise_clock_alarm(session, model, batch.stream_id, arrival.leap)
     begun = event.number if arrival.first else before.begun
-    after = replace(judgement.stream, leapt=arrival.leap is not None, begun=begun)
+    play = before.play if arrival.play is None else arrival.play
+    after = replace(judgement.stream, leapt=arrival.leap is not None, begun=begun, play=play)
     source.record = after.to_json()
     answer = ObservationResponse(
         model=model,

@@ -21,7 +21,7 @@ from service.inference.predicting import QUANTITIES
 from service.journal import log
 from service.journal.arrivals import NewBatch, check_kind
 from service.learning import owner
-from service.learning.ingest.append import Arrival, ObservationLog
+from service.learning.ingest.append import Arrival, ObservationLog, follow_rows
 from service.learning.ingest.observations import REUSE_HINT, check_not_expired, row_limits
 from service.models.loaded import ServedModel
 from service.storage.database import EventRow
@@ -95,6 +95,8 @@ def observe_frames(observed: ObservationLog, frames: Frames) -> FramesResult:
         # the service dates frames when they arrive, so their times need no check
         weights = independence.stream_weights(frames.time[new], None if before is None else before.last)
         rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
+        followed = follow_rows(monitor, frames.served, frames.stream_id, source, last + 1, rows)
+        rows = followed.rows
         carrying = frames.served.payloads.model_for(frames.stream_id)
         other_load = frames.loaded != (carrying is not None)
         answered = StreamAnswers(frames.mean, frames.std, frames.factor, other_load).take(new)
@@ -113,7 +115,9 @@ def observe_frames(observed: ObservationLog, frames: Frames) -> FramesResult:
             rows,
         )
         place = Placement((0, len(rows)), frames=_ranges(sequences))
-        answer = observed.append(monitor, frames.served, options, Arrival(batch, screened, source is None, place))
+        answer = observed.append(
+            monitor, frames.served, options, Arrival(batch, screened, source is None, place, play=followed.play)
+        )
     observed.follow_up(monitor, frames.model)
     return FramesResult(int(sequences[-1]), answer.accepted, repeated.frames, answer.rejected, answer.revision)
 

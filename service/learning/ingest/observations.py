@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from struct import pack
 
 import numpy as np
@@ -32,7 +33,7 @@ from service.journal import log
 from service.journal.arrivals import NewBatch, check_kind, is_forgotten
 from service.journal.log import StreamHistory
 from service.learning import owner
-from service.learning.ingest.append import Arrival, ObservationLog
+from service.learning.ingest.append import Arrival, ObservationLog, follow_rows
 from service.storage.database import EventRow, StreamRow
 
 MAX_ROWS = 5000
@@ -61,6 +62,8 @@ def observe_batch(observed: ObservationLog, model: str, request: ObservationRequ
             options = owner.read_options(session, model)
             limits = row_limits(served.model, options, observed.settings)
             dated = _date_batch(batch, past, sequence, received, limits, options)
+            followed = follow_rows(monitor, served, stream_id, past.source, sequence, dated.rows)
+            dated = replace(dated, rows=followed.rows)
             rows, own, derived = _derive_accelerations(session, (model, stream_id, sequence), batch, dated, limits)
         predicted = screening.predict(rows, served, own, carrying=served.payloads.model_for(stream_id))
         entry = NewBatch(
@@ -76,7 +79,7 @@ def observe_batch(observed: ObservationLog, model: str, request: ObservationRequ
             rows,
         )
         place = Placement((own.start, own.stop), dated.span)
-        arrival = Arrival(entry, predicted, past.source is None, place, derived, dated.leap)
+        arrival = Arrival(entry, predicted, past.source is None, place, derived, dated.leap, followed.play)
         answer = observed.append(monitor, served, options, arrival)
     observed.follow_up(monitor, model)
     return answer

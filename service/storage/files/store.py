@@ -12,8 +12,9 @@ import os
 import secrets
 import tempfile
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -106,11 +107,17 @@ class Files:
         return self._place.write(_samples(dataset), lambda file: sample_file.write(file, rows, n_joints, array))
 
     def read_samples(
-        self, dataset: str, joint_names: list[str], sha256: str, most: int | None = None, part: PartOf | None = None
+        self,
+        dataset: str,
+        joint_names: list[str],
+        sha256: str,
+        most: int | None = None,
+        part: PartOf | None = None,
+        joint_types: Sequence[str] | None = None,
     ) -> Samples:
         """Return the samples stored under `dataset`, or part of them, evenly thinned to `most`.
 
-        Raise DamagedDataError if the file is missing or changed.
+        joint_types: to include deflections; None for none. Raise DamagedDataError if the file is missing or changed.
         """
         path = self.samples_file(dataset, sha256)
         chosen = None
@@ -121,7 +128,11 @@ class Files:
         if most is not None and count > most:
             thinned = np.linspace(0, count - 1, most).round().astype(np.int64)
             chosen = thinned if chosen is None else chosen[thinned]
-        return Samples(joint_names=tuple(joint_names), **sample_file.read(path, chosen))
+        found = Samples(joint_names=tuple(joint_names), **sample_file.read(path, chosen))
+        if joint_types is None:
+            return found
+        index = np.arange(count) if chosen is None else chosen
+        return replace(found, deflections=sample_file.follow(sample_file.Reader(path), index, joint_types))
 
     def samples_file(self, dataset: str, sha256: str) -> Path:
         """Return the path of a data set's samples, see sample_file.py; raise DamagedDataError as `read_samples`.
