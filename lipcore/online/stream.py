@@ -95,7 +95,7 @@ class StreamRecord:
             "payload": None if self.payload is None else self.payload.to_json(),
             "leapt": self.leapt,
             "begun": self.begun,
-            "play": None if self.play is None else self.play.to_json(),
+            "play": None if self.play is None else self.play.packed.tolist(),
         }
 
     def decided(self) -> StreamRecord:
@@ -121,6 +121,6 @@ class StreamRecord:
             None if payload is None else PayloadRecord(**payload),
             values["leapt"],
             values["begun"],
-            None if play is None else PlayState.from_json(play),
+            None if play is None else PlayState(np.array(play, np.float64)),
             received,
         )

@@ -21,16 +21,15 @@ deviate from this by at most 1.0 times as much for |s| < 2.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array
 from lipcore.data.samples import Samples
-from lipcore.kernels.fast.play import CERTAIN_SHARE, follow
+from lipcore.kernels.fast.play import CERTAIN_SHARE, POSITIONS, follow
 
 ELEMENTS = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 """Widths of the elements of a revolute joint, rad. All models have the same, so that the deflections of a stream are
@@ -47,30 +46,26 @@ def element_widths(joint_types: Sequence[str]) -> Array:
     return np.array(ELEMENTS)[:, None] * scale
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlayState:
-    """What is known about the deflections of n joints at the end of a motion."""
+    """What is known about the deflections of n joints at one instant, and the instant itself.
 
-    bounds: Array
-    """Lower and upper bound of each deflection, (2, K, n)."""
-    q: Array
-    """Position at the end, (n,)."""
-    dq: Array
-    """Velocity at the end, (n,)."""
-    time: float
-    """Time of the end, s; negative infinity before any motion."""
+    packed: (1 + 2 n + 2 K n,), time, q, dq, and the lower and upper bound of each deflection, element by element.
+    """
+
+    packed: Array
 
     @classmethod
     def unknown(cls, n: int) -> PlayState:
         """Return the state before any motion."""
-        bounds = np.stack([np.full((len(ELEMENTS), n), each) for each in (-1.0, 1.0)])
-        return cls(bounds, np.zeros(n), np.zeros(n), -np.inf)
+        return cls(np.concatenate([[-np.inf], np.zeros(2 * n), np.tile([-1.0, 1.0], len(ELEMENTS) * n)]))
 
     @classmethod
     def at(cls, time: float, q: Array, dq: Array, deflections: Array) -> PlayState:
-        """Return the state at one instant. q, dq: (n,); deflections: (2 K, n), as in `Motion`."""
+        """Return the state at one instant. time: s; q, dq: (n,); deflections: (2 K, n), as in `Motion`."""
         expected, std = np.split(deflections, 2)
-        return cls(np.stack([expected - std, expected + std]), q.copy(), dq.copy(), time)
+        bounds = np.stack([expected - std, expected + std], axis=-1)
+        return cls(np.concatenate([[time], q, dq, bounds.reshape(-1)]))
 
     def follow(
         self, time: Array, q: Array, dq: Array, widths: Array, begins: NDArray[np.bool_] | None = None
@@ -81,35 +76,31 @@ class PlayState:
         Instants with a number that is not finite are left out. time: (N,) s; q, dq: (N, n); begins: (N,), instants that
         begin another motion.
         """
-        finite = np.isfinite(time) & np.isfinite(q).all(axis=1) & np.isfinite(dq).all(axis=1)
-        if not finite.all():
-            out = np.repeat([0.0, 1.0], len(widths))[None, :, None] * np.ones((len(q), 1, q.shape[1]))
-            kept = None if begins is None else begins[finite]
-            out[finite], after = self.follow(time[finite], q[finite], dq[finite], widths, kept)
-            return out, after
-        out = np.empty((len(q), 2 * len(widths), q.shape[1]))
-        if not len(q):
-            return out, self
-        elapsed = np.diff(time, prepend=self.time)
-        fresh = ~((elapsed >= 0) & (elapsed <= MAX_GAP_S))
-        usual = 0.5 * (dq + np.concatenate([self.dq[None], dq[:-1]])) * np.where(fresh, 0.0, elapsed)[:, None]
-        moved = np.diff(q, axis=0, prepend=self.q[None])
-        fresh |= (np.abs(moved - usual) > widths.max(axis=0)).any(axis=1)
-        if begins is not None:
-            fresh |= begins
-        bounds, last = self.bounds.copy(), self.q.copy()
-        follow(np.ascontiguousarray(q, np.float64), fresh, widths, bounds, last, out)
-        return out, PlayState(bounds, last, dq[-1].copy(), float(time[-1]))
+        out, packed = np.empty((len(q), 2 * len(widths), q.shape[1])), self.packed.copy()
+        begins = np.zeros(len(q), np.bool_) if begins is None else begins
+        time, q, dq = (np.ascontiguousarray(each, np.float64) for each in (time, q, dq))
+        follow(time, q, dq, begins, widths, MAX_GAP_S, packed, out)
+        return out, PlayState(packed)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the fields as numbers and lists; `from_json` restores them to the last bit."""
-        return {"bounds": self.bounds.tolist(), "q": self.q.tolist(), "dq": self.dq.tolist(), "time": self.time}
 
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> PlayState:
-        """Read what `to_json` returned."""
-        bounds, q, dq = (np.array(values[name], np.float64) for name in ("bounds", "q", "dq"))
-        return cls(bounds, q, dq, float(values["time"]))
+class PlayFollower:
+    """Follows one motion instant by instant, in microseconds.
+
+    motion: (3 + 2 K, n), see `Motion.arrays`; the caller writes q, dq and ddq of the next instant into its first rows.
+    """
+
+    def __init__(self, widths: Array) -> None:
+        elements, n = widths.shape
+        self._widths, self._state = widths, PlayState.unknown(n).packed
+        self._begins, self._time = np.zeros(1, np.bool_), np.empty(1)
+        self.motion: Array = np.zeros((POSITIONS + 2 * elements, n))
+        self._views = self.motion[:1], self.motion[1:2], self.motion[None, POSITIONS:]
+
+    def step(self, time: float) -> None:
+        """Write the deflections of the instant into `motion`. time: s."""
+        q, dq, out = self._views
+        self._time[0] = time
+        follow(self._time, q, dq, self._begins, self._widths, MAX_GAP_S, self._state, out)
 
 
 def with_deflections(samples: Samples, joint_types: Sequence[str]) -> Samples:

@@ -17,25 +17,41 @@ POSITIONS = 3
 
 
 @compiled
-def follow(q: Array, fresh: Flags, widths: Array, bounds: Array, last: Array, out: Array) -> None:
-    """Write the deflections along N instants, (N, 2 K, n), and update the state in place.
+def follow(
+    time: Array, q: Array, dq: Array, begins: Flags, widths: Array, max_gap: float, state: Array, out: Array
+) -> None:
+    """Write the deflections along N instants, (N, 2 K, n), and update the state in place, see `PlayState`.
 
-    q: (N, n); fresh: (N,), instants whose motion before is unknown; widths: (K, n); bounds: (2, K, n), the range of
-    each deflection before the first instant; last: (n,), position then.
+    time: (N,) s; q, dq: (N, n); begins: (N,), instants whose motion before is unknown; widths: (K, n); max_gap: s;
+    state: (1 + 2 n + 2 K n,), time, q and dq of the instant before, and the bounds of the deflections then. Instants
+    that are not finite do not change the state.
     """
     elements, n = widths.shape
-    for row in range(q.shape[0]):
+    bounds = 1 + 2 * n
+    for row in range(len(time)):
+        elapsed = time[row] - state[0]
+        fresh, finite = begins[row] or not 0.0 <= elapsed <= max_gap, np.isfinite(time[row])
+        for j in range(n):
+            finite = finite and np.isfinite(q[row, j]) and np.isfinite(dq[row, j])
+            if not fresh:
+                expected = 0.5 * (dq[row, j] + state[1 + n + j]) * elapsed
+                fresh = not abs(q[row, j] - state[1 + j] - expected) <= widths[elements - 1, j]
         for k in range(elements):
             for j in range(n):
-                if fresh[row]:
-                    bounds[0, k, j], bounds[1, k, j] = -1.0, 1.0
-                else:
-                    step = (q[row, j] - last[j]) / widths[k, j]
-                    bounds[0, k, j] = min(max(bounds[0, k, j] + step, -1.0), 1.0)
-                    bounds[1, k, j] = min(max(bounds[1, k, j] + step, -1.0), 1.0)
-                out[row, k, j] = 0.5 * (bounds[0, k, j] + bounds[1, k, j])
-                out[row, elements + k, j] = 0.5 * (bounds[1, k, j] - bounds[0, k, j])
-        last[:] = q[row]
+                low, high = -1.0, 1.0
+                at = bounds + 2 * (n * k + j)
+                if finite and not fresh:
+                    step = (q[row, j] - state[1 + j]) / widths[k, j]
+                    low = min(max(state[at] + step, -1.0), 1.0)
+                    high = min(max(state[at + 1] + step, -1.0), 1.0)
+                if finite:
+                    state[at], state[at + 1] = low, high
+                out[row, k, j] = 0.5 * (low + high)
+                out[row, elements + k, j] = 0.5 * (high - low)
+        if finite:
+            state[0] = time[row]
+            state[1 : 1 + n] = q[row]
+            state[1 + n : bounds] = dq[row]
 
 
 @inlined

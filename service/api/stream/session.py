@@ -16,6 +16,7 @@ import numpy as np
 from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
+from lipcore.kernels.drive.play import PlayFollower, element_widths
 from lipcore.model.external import external
 from service.api.access.middleware import subprotocol_of
 from service.api.errors import UNEXPECTED_ERROR
@@ -218,6 +219,7 @@ class Session(Conversation):
         self._sends_scale, self._sends_payload, self._stream_id = scale, payload, stream_id
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
         self._learning = None if stream_id is None else FrameLearning(learners, stream_id, self.send_text)
+        self._follower: PlayFollower | None = None  # a session's frames are one motion
         self._use_version(served)
 
     async def run(self) -> None:
@@ -260,6 +262,10 @@ class Session(Conversation):
             if current is not self._served or self._payloads.model_for(self._stream_id) is not self._payload_model:
                 await self._update_version(current)
             motion = self._reader.read(data, asked, n, budget)
+            if self._follower is not None:
+                self._follower.motion[: len(motion)] = motion
+                self._follower.step(arrived)
+                motion = self._follower.motion
             if asked & frames.ASK_LEARN:
                 await self._admit(sequence, asked)
             compares = asked >= frames.ASK_EXTERNAL
@@ -373,6 +379,10 @@ class Session(Conversation):
     def _use_version(self, served: ServedModel) -> None:
         self._served, self._payloads, self._noise_std = served, served.payloads, np.array(served.noise_std)
         self._update_payload()
+        if not served.model.remembers:
+            self._follower = None
+        elif self._follower is None:
+            self._follower = PlayFollower(element_widths(served.model.joint_types))
         limits = served.model.position_limits(self.settings.max_position)
         self._reader = FrameReader(served.model.joint_names, limits)
 
