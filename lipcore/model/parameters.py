@@ -61,6 +61,12 @@ class Friction:
     load: Array | None = None
     """Friction per torque that the bodies need; None if the model does not have it."""
     load_std: Array | None = None
+    breakaway: Array | None = None
+    """Friction of a joint that begins to slip, N·m (N); None if friction does not remember where the joint came from."""
+    breakaway_std: Array | None = None
+    stiffness: Array | None = None
+    """Stiffness of a joint that has turned back, before it slips, N·m/rad (N/m); None likewise."""
+    stiffness_std: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -113,9 +119,14 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
     mean, joints = weights.mean.reshape(n, f), np.arange(n)
     covariance = weights.covariance.reshape(n, f, n, f)[joints, :, joints]  # (n, f, f)
     named = {}
-    for name, row in summary_rows(term.drive.kinds).items():
-        named[name] = mean @ row
-        named[f"{name}_std"] = np.sqrt(np.maximum(np.einsum("f,nfg,g->n", row, covariance, row), 0.0))
+    rows = {name: np.tile(row, (n, 1)) for name, row in summary_rows(term.drive.kinds).items()}
+    if (elements := term.drive.elements) is not None:
+        rows["breakaway"] = rows["coulomb"] + rows.get("stribeck", 0.0)
+        rows["stiffness"] = np.zeros((n, f))
+        rows["stiffness"][:, -len(elements.widths) :] = 1 / elements.widths.T
+    for name, row in rows.items():
+        named[name] = np.einsum("nf,nf->n", mean, row)
+        named[f"{name}_std"] = np.sqrt(np.maximum(np.einsum("nf,nfg,ng->n", row, covariance, row), 0.0))
     return Friction(**named)
 
 
@@ -174,7 +185,7 @@ def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Seque
     out: dict[str, Any] = {
         "friction": {
             name: {"mean": getattr(friction, name).tolist(), "std": getattr(friction, f"{name}_std").tolist()}
-            for name in ("viscous", "coulomb", "offset", "stribeck", "load")
+            for name in ("viscous", "coulomb", "offset", "stribeck", "load", "breakaway", "stiffness")
             if getattr(friction, name) is not None
         }
     }

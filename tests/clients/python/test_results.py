@@ -187,7 +187,15 @@ def test_text_and_html_show_every_joint_and_unidentifiable_parameters(arm):
     assert arm.as_dict()["frames"]["mode"] == "learn"
 
 
-@pytest.mark.parametrize(("kind", "head"), [("stribeck", "at low speed N·m"), ("load", "share of the load")])
+@pytest.mark.parametrize(
+    ("kind", "head"),
+    [
+        ("stribeck", "at low speed N·m"),
+        ("load", "share of the load"),
+        ("breakaway", "breakaway N·m"),
+        ("stiffness", "presliding N·m/rad"),
+    ],
+)
 def test_further_friction_is_shown_if_estimated(robot, arm, kind, head):
     parameters = parameters_of(robot)
     parameters["friction"][kind] = {"mean": [float(k) for k in range(7)], "std": [0.01] * 7}

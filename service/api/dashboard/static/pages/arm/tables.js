@@ -19,7 +19,6 @@ export function jointTable({ joint_names: names, parameters: { geometry } }) {
     { label: "Position, m", numeric: true, cell: (place) => vector(zero[place].origin) },
     { label: "± turn, °", numeric: true, cell: (place) => stds(geometry.joints[place].turn_std, DEGREES) },
     { label: "± shift, mm", numeric: true, cell: (place) => stds(geometry.joints[place].shift_std, 1000) },
-    ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: (joint) => pair(friction.load, joint) }] : []),
     { label: "Unidentifiable", cell: (place) => geometry.joints[place].undetermined.join(", ") || "–" },
   ];
   return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Joint axes from base to tip, in the base frame, with all positions at zero; ±: one standard deviation in two directions across the axis" });
@@ -42,6 +41,8 @@ export function massTable({ joint_names: names, joint_types: types, parameters }
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },
     ...(friction.stribeck ? [{ label: "Stribeck, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
     ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: (joint) => pair(friction.load, joint) }] : []),
+    ...(friction.breakaway ? [{ label: "Breakaway, N·m", numeric: true, cell: (joint) => pair(friction.breakaway, joint) }] : []),
+    ...(friction.stiffness ? [{ label: "Presliding, N·m/rad", numeric: true, cell: (joint) => pair(friction.stiffness, joint) }] : []),
     { label: "Unidentifiable", cell: (joint) => (inertia.bodies[joint].undetermined ?? []).map((each) => each.replace("_", " ")).join(", ") || "–" },
   ];
   return h("div", { class: "dense" }, table(columns, geometry.order, { caption: `Bodies in their joint frames, and friction; ±: one standard deviation${sliding}` }));
