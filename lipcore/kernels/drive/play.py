@@ -6,16 +6,16 @@ slip). Its deflection e, in units of r, follows the position:
     e ← clip(e + Δq / r, −1, 1)
 
 After a stroke of 2 r in one direction e is ±1, wherever it was before. Until then it is known to lie between two bounds
-that follow the same rule and begin at −1 and 1. The expected deflection is their middle. Its standard deviation is half of
-their distance: a joint that has stopped may have slipped in either direction.
+that follow the same rule and begin at −1 and 1. The expected deflection is their middle. Its standard deviation is half
+of their distance: a joint that has stopped may have slipped in either direction.
 
-If one instant alone is known, its velocity v and acceleration a tell where the joint comes from. With A² = a² + (0.1 u)²
-and the usual acceleration u,
+If one instant alone is known, its velocity v and acceleration a tell where the joint comes from. With
+A² = a² + (0.1 u)² and the usual acceleration u,
 
     e = clip(s − a / A, −1, 1),    s = v |v| / (2 A r)
 
-s is the stroke since standstill. Before it the joint moved against its acceleration: a joint that slows down has slipped
-already. The standard deviation is exp(−|s| / 2). On recordings of eight real arms, deflections that are known deviate
+s is the stroke since standstill. Before it the joint moved against its acceleration: a joint that slows down has
+slipped already. The standard deviation is exp(−|s| / 2). On recordings of eight real arms, deflections that are known deviate
 from this by at most 1.0 times as much for |s| < 2.
 """
 
