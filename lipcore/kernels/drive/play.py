@@ -15,8 +15,8 @@ A² = a² + (0.1 u)² and the usual acceleration u,
     e = clip(s − a / A, −1, 1),    s = v |v| / (2 A r)
 
 s is the stroke since standstill. Before it the joint moved against its acceleration: a joint that slows down has
-slipped already. The standard deviation is exp(−|s| / 2). On recordings of eight real arms, deflections that are known deviate
-from this by at most 1.0 times as much for |s| < 2.
+slipped already. The standard deviation is exp(−|s| / 2). On recordings of eight real arms, deflections that are known
+deviate from this by at most 1.0 times as much for |s| < 2.
 """
 
 from __future__ import annotations

@@ -258,6 +258,8 @@ def test_model_with_play_is_stored_and_restored(tmp_path: Path) -> None:
         ("misfit", np.ones((15, 3)), r"'misfit' has shape \(15, 3\), expected \(16, 3\)"),
         ("misfit", np.ones((16, 2)), r"'misfit' has shape \(16, 2\), expected \(16, 3\)"),
         ("misfit", -np.ones((16, 3)), "'misfit' has a number below zero"),
+        ("misfit", np.ones((6, 3)), "tensor 'misfit' needs rows of play elements if friction has play"),
+        ("misfit", None, "tensor 'misfit' needs rows of play elements"),
     ],
 )
 def test_wrong_tensor_of_play_is_named(tmp_path: Path, name: str, replacement: Array | None, message: str) -> None:
