@@ -4,7 +4,7 @@
 
 Every arm is trained on 10 s and on 60 s of random sinusoids at 100 Hz, prepared like recordings (4 Hz low-pass without
 delay). It is tested on at least MIN_TEST_S of other motion of the same kind, of motion three times as fast, and of
-moves with rests, about as fast as in training.
+moves with rests, about as fast as in training. Friction follows the motion.
 
 Coverage is the mean over the seeds; `lowest` is that of one seed and joint. `width` is the width of the interval over
 the central 95 % of a Gaussian with the standard deviation of the errors, the median over seeds and joints. A cell is a
@@ -74,7 +74,7 @@ def main() -> None:
                 model = lipcore.train(known, robot.joint_types, estimator)
                 for case in CASES:
                     held = unseen(robot, recording(seconds, dirt), case, seed)
-                    answer = model.predict(held.q, held.dq, held.ddq)
+                    answer = model.predict_along(held)
                     metrics = evaluate(held.tau, *answer.interval)
                     oracle = 2 * quantile(LEVEL) * (held.tau - answer.tau).std(0)
                     cells[case].append(np.array([metrics.coverage, metrics.width / oracle]))

@@ -322,6 +322,9 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
         raise ModelFormatError(f"{TENSORS} has the tensor {strange!r}, but the estimator has no rigid bodies", TENSORS)
     options, calibration = manifest["options"], Calibration(**manifest["calibration"])
     estimator = make_estimator(manifest["estimator"], manifest["joint_types"], bool(options.get("tied", True)), arm)
+    misfit = Misfit.unpacked(tensors[MISFIT]) if MISFIT in tensors else None
+    if (misfit is not None and misfit.elements.size > 0) != (arm is not None and "play" in arm.drive):
+        raise ModelFormatError(f"tensor {MISFIT!r} needs rows of play elements if friction has play", TENSORS)
     posterior = CompactPosterior.restore(
         estimator.kernel,
         params,
@@ -330,7 +333,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
         statistics,
         float(manifest["fit"].get("jitter", 0.0)),
         calibration.function_std_factor,
-        Misfit.unpacked(tensors[MISFIT]) if MISFIT in tensors else None,
+        misfit,
     )
     if FLOOR in tensors:
         posterior = replace(posterior, floor=tensors[FLOOR])

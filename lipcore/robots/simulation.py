@@ -73,7 +73,9 @@ def simulate(robot: Robot, simulation: Simulation, seed: int) -> Samples:
         "coulomb", simulation.coulomb, robot
     ) * np.sign(dq)
     if simulation.dirt is not None:
-        tau = simulation.dirt.torque(t, q, dq, tau, usual_torque(robot), rng)
+        usual = usual_torque(robot)
+        q, dq = simulation.dirt.motor_side(t, q, dq, tau, usual)
+        tau = simulation.dirt.torque(t, q, dq, tau, usual, rng)
         q, dq, ddq = simulation.dirt.motion(t, q)
     t, q, dq, ddq, tau = (np.ascontiguousarray(values[::fine]) for values in (t, q, dq, ddq, tau))
     tau = tau + simulation.noise * rng.standard_normal(tau.shape)

@@ -76,6 +76,9 @@ DirtShare = Annotated[
         min=0.0,
     ),
 ]
+DriveName = Annotated[
+    str, simulation("Friction with --dirt: lugre, maxwell (elements that slip), or elastic (lugre behind a spring).")
+]
 
 
 def group(help_: str) -> typer.Typer:

@@ -17,6 +17,7 @@ from service.cli.options import (
     Along,
     Coulomb,
     DirtShare,
+    DriveName,
     Fast,
     Json,
     Mass,
@@ -63,8 +64,10 @@ def described(
     payload: float,
     payload_at: float,
     dirt: float,
+    drive: str,
 ) -> Simulation:
-    """Return the simulation that the options describe; `simulate` checks it."""
+    """Return the simulation that the options describe; `simulate` checks it. Raise ValueError for other drives."""
+    imperfect = Dirt(drive=drive)  # type: ignore[arg-type]  # it checks it
     return Simulation(
         n_samples=samples,
         rate=rate,
@@ -76,7 +79,7 @@ def described(
         coulomb=coulomb,
         payload=Payload(payload, payload_at) if payload else None,
         course=course,  # type: ignore[arg-type]  # as above
-        dirt=Dirt().scaled(dirt) if dirt else None,
+        dirt=imperfect.scaled(dirt) if dirt else None,
     )
 
 
@@ -100,11 +103,12 @@ def simulate_(
     payload: Mass = 0.0,
     payload_at: MassAt = 0.0,
     dirt: DirtShare = 0.0,
+    drive: DriveName = "lugre",
     as_json: Json = False,
 ) -> None:
     """Simulate a robot with Pinocchio and write its motion as a recording."""
     stream = described(
-        samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt
+        samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt, drive
     )
     data = simulate(load_robot(robot), stream, seed)
     write_recording(output, data)

@@ -19,6 +19,7 @@ from service.cli.options import (
     Along,
     Coulomb,
     DirtShare,
+    DriveName,
     Fast,
     Json,
     Mass,
@@ -93,6 +94,7 @@ def stream(
     payload: Mass = 0.0,
     payload_at: MassAt = 0.0,
     dirt: DirtShare = 0.0,
+    drive: DriveName = "lugre",
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
@@ -114,7 +116,7 @@ def stream(
     else:
         samples = max(2, round((seconds or 60.0) * rate))
         asked = described(
-            samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt
+            samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt, drive
         )
         played = simulated(simulate or "", asked, seed)
     source = (stream_id or f"lipserve-{secrets.token_hex(4)}") if learn else None

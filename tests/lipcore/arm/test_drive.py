@@ -3,28 +3,35 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lipcore import FitOptions, Samples, TorqueModel, load, save
+from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save
 from lipcore.arm import drive
 from lipcore.arm.drive import choose_drive, held_out_errors
 from lipcore.arm.posing import make_problem, with_kind
 from lipcore.arm.problem import Point, Problem
-from lipcore.data.motion import Motion
-from lipcore.kernels.drive.kernel import Drive
-from lipcore.kernels.drive.terms import drive_features, drive_terms, summary_rows
+from lipcore.data.metrics import evaluate
+from lipcore.data.motion import Array, Motion
+from lipcore.kernels.drive.kernel import Drive, DriveKernel
+from lipcore.kernels.drive.play import ELEMENTS, with_deflections
+from lipcore.kernels.drive.terms import KIND_TERMS, drive_features, drive_terms, summary_rows
 from lipcore.model.dynamics import forward_dynamics
-from lipcore.model.parameters import friction_coefficients
-from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
+from lipcore.model.parameters import friction_coefficients, weight_posterior
+from lipcore.robots.dirt import MAXWELL_ELEMENTS, Dirt
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate, usual_torque
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 from tests.choosing import slow
 from tests.lipcore.arm_oracles import arm, nmse_per_joint, train_from_geometry
+from tests.lipcore.files.test_persistence import edit_tensor
 
 GEOMETRY, BODIES, ROBOT = arm("RRR", 31)
 SHARE = 0.08
 """Friction per torque that the bodies need."""
+MAXWELL = Dirt(load=0.5, position=0.0, warmth=0.0, ripple=0.0, gain=0.0, noise=0.005, seed=3, drive="maxwell")
+"""Friction that the terms of the drive can express, with noise of 0.5 % of the usual torque."""
 
 
 def simulate_friction(seed: int, kind: str = "none") -> Samples:
@@ -45,6 +52,18 @@ def simulate_friction(seed: int, kind: str = "none") -> Samples:
 @cache
 def train_friction(kind: str) -> TorqueModel:
     return train_from_geometry(GEOMETRY, ROBOT, simulate_friction(1, kind), FitOptions(device="cpu"))
+
+
+@cache
+def simulate_maxwell(seed: int, speed: float = 6.0) -> Samples:
+    """Simulate an arm whose friction remembers: 40 s, without the ends, where filters are less accurate."""
+    stream = Simulation(1000, 25.0, n_sinusoids=30, speed=speed, noise=0.0, dirt=MAXWELL)
+    return with_deflections(simulate(ROBOT, stream, seed).rows(slice(5, -5)), ROBOT.joint_types)
+
+
+@cache
+def train_maxwell() -> TorqueModel:
+    return train_from_geometry(GEOMETRY, ROBOT, simulate_maxwell(1), FitOptions(device="cpu"))
 
 
 def pose(samples: Samples) -> tuple[Problem, Point]:
@@ -76,11 +95,69 @@ def test_share_of_the_load_is_recovered() -> None:
     assert (np.abs(friction.coulomb - 0.4) < 3 * friction.coulomb_std).all()
 
 
+def test_play_and_share_of_the_load_are_recovered() -> None:
+    model, truth = train_maxwell(), MAXWELL.coefficients(usual_torque(ROBOT))
+    assert model.fit["drive"] == "load, play"
+    friction = friction_coefficients(model.posterior, model.estimator)
+    assert friction.load is not None
+    assert friction.load_std is not None
+    slipped = truth.coulomb + truth.elements.sum(axis=0)
+    for found, std, expected in (
+        (friction.load, friction.load_std, truth.load),
+        (friction.coulomb, friction.coulomb_std, slipped),
+        (friction.viscous, friction.viscous_std, truth.viscous),
+    ):
+        assert (np.abs(found - expected) < 3 * std).all()
+    assert (friction.load_std < 0.1 * truth.load).all()
+    assert (friction.coulomb_std < 0.2 * slipped).all()
+
+
+def test_torque_of_each_element_is_recovered() -> None:
+    model, truth = train_maxwell(), MAXWELL.coefficients(usual_torque(ROBOT))
+    term = model.estimator.terms["friction"]
+    assert isinstance(term, DriveKernel)
+    weights, terms = weight_posterior(model.posterior, term), list(term.drive.terms)
+    torques = dict(zip((width for width, _ in MAXWELL_ELEMENTS), truth.elements, strict=True))
+    expected = np.array([torques.get(width, np.zeros(3)) for width in ELEMENTS])
+    places = np.array([terms.index(each) for each in KIND_TERMS["play"]])
+    for joint in range(3):
+        own = places + joint * len(terms)
+        found, covariance = weights.mean[own], weights.covariance[np.ix_(own, own)]
+        std = np.sqrt(covariance.diagonal())
+        assert (np.abs(found - expected[:, joint]) < 3 * std).all()
+        assert (std < 0.15 * expected[:, joint].max()).all()
+        assert np.abs(found.sum() - expected[:, joint].sum()) < 3 * np.sqrt(covariance.sum())
+
+
+def test_prediction_along_a_motion_is_better_than_without_play(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, unseen = train_maxwell(), simulate_maxwell(2)
+    monkeypatch.setattr(drive, "OPTIONS", replace(drive.OPTIONS, kinds=DRIVE_KINDS[:-1]))
+    without = train_from_geometry(GEOMETRY, ROBOT, simulate_maxwell(1), FitOptions(device="cpu"))
+    assert not without.remembers
+    along = evaluate(unseen.tau, *model.predict_along(unseen).interval)
+    assert (np.asarray(along.nmse) < 0.1 * nmse_per_joint(without, unseen)).all()
+    assert (np.asarray(along.coverage) > 0.88).all()
+    # deflections that are not given are computed
+    again = model.predict_along(replace(unseen, deflections=None))
+    assert np.array_equal(again.tau, model.predict_along(unseen).tau)
+
+
+@pytest.mark.parametrize("speed", [6.0, 1.2])
+def test_intervals_without_history_are_wider_at_low_speed(speed: float) -> None:
+    model, unseen = train_maxwell(), simulate_maxwell(5, speed)
+    alone = model.predict(unseen.q, unseen.dq, unseen.ddq)
+    coverage = np.asarray(evaluate(unseen.tau, *alone.interval).coverage)
+    assert ((coverage >= 0.88) & (coverage <= 1.0)).all(), coverage
+    slow = np.abs(unseen.dq) < 0.05
+    widths = [np.where(slow, each.tau_std, np.nan) for each in (alone, model.predict_along(unseen))]
+    assert (np.nanmean(widths[0], axis=0) > 2 * np.nanmean(widths[1], axis=0)).all()
+
+
 @pytest.mark.parametrize("kind", ["none", "falling load"])
 def test_unsupported_kinds_are_left_out(kind: str) -> None:
-    problem, point = pose(simulate_friction(1, kind))
+    problem, point = pose(with_deflections(simulate_friction(1, kind), ROBOT.joint_types))
     chosen = choose_drive(problem, point, np.arange(len(problem.tau)), lambda: False)
-    assert "load" not in chosen.problem.drive.kinds
+    assert not {"load", "play"} & set(chosen.problem.drive.kinds)
     if kind == "none":
         assert chosen.problem.drive.kinds == ()
         assert chosen.nats == 0.0
@@ -96,7 +173,7 @@ def test_held_out_blocks_reject_what_the_evidence_accepts(monkeypatch: pytest.Mo
 
 def test_held_out_errors_are_those_of_separate_fits() -> None:
     problem, point = pose(simulate_friction(1, "load"))
-    problem = with_kind(problem, point, "load")
+    problem = with_kind(problem, point, "load", np.ones(3, np.bool_))
     point = problem.at(point.geometry, point.sigma)
     blocks = np.arange(len(problem.tau)) // 100
     both = problem.all_features(point)
@@ -152,6 +229,44 @@ def test_model_with_load_is_stored_and_restored(tmp_path) -> None:
     before, after = (each.predict(unseen.q, unseen.dq, unseen.ddq) for each in (model, again))
     np.testing.assert_allclose(after.tau, before.tau, rtol=1e-9)
     np.testing.assert_allclose(after.tau_std, before.tau_std, rtol=1e-6)
+
+
+def test_model_with_play_is_stored_and_restored(tmp_path: Path) -> None:
+    model, unseen = train_maxwell(), simulate_maxwell(2)
+    save(model, tmp_path / "model")
+    again = load(tmp_path / "model")
+    assert again.arm is not None
+    assert again.arm.drive == ("load", "play")
+    assert again.remembers
+    assert np.array_equal(again.posterior.misfit.packed(), model.posterior.misfit.packed())
+    for deflections in (unseen.deflections, None):
+        before, after = (
+            each.predict(unseen.q, unseen.dq, unseen.ddq, deflections=deflections) for each in (model, again)
+        )
+        np.testing.assert_allclose(after.tau, before.tau, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(after.tau_std, before.tau_std, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "replacement", "message"),
+    [
+        ("arm/acceleration", None, "'arm/acceleration' is wrong, expected one positive number a joint"),
+        ("arm/acceleration", np.ones(2), "'arm/acceleration' is wrong"),
+        ("arm/acceleration", np.array([1.0, 0.0, 1.0]), "'arm/acceleration' is wrong"),
+        ("arm/acceleration", np.array([1.0, np.nan, 1.0]), "'arm/acceleration' is not made of finite"),
+        ("arm/drive", np.array([0.0, 0.0, 0.0, 1.0, 0.0]), "'arm/acceleration' is wrong"),
+        ("misfit", np.ones((15, 3)), r"'misfit' has shape \(15, 3\), expected \(16, 3\)"),
+        ("misfit", np.ones((16, 2)), r"'misfit' has shape \(16, 2\), expected \(16, 3\)"),
+        ("misfit", -np.ones((16, 3)), "'misfit' has a number below zero"),
+        ("misfit", np.ones((6, 3)), "tensor 'misfit' needs rows of play elements if friction has play"),
+        ("misfit", None, "tensor 'misfit' needs rows of play elements"),
+    ],
+)
+def test_wrong_tensor_of_play_is_named(tmp_path: Path, name: str, replacement: Array | None, message: str) -> None:
+    save(train_maxwell(), tmp_path / "model")
+    edit_tensor(tmp_path / "model", name, lambda values: replacement)
+    with pytest.raises(ModelFormatError, match=message):
+        load(tmp_path / "model")
 
 
 def test_forward_dynamics_inverts_torque_with_load() -> None:

@@ -58,6 +58,38 @@ def test_concatenation_keeps_row_order_and_separates_episodes() -> None:
     assert len(joined.episodes()) == 4
 
 
+def with_elements(samples: Samples, seed: int = 0) -> Samples:
+    """Return samples with random deflections of two elements."""
+    return replace(samples, deflections=np.random.default_rng(seed).uniform(-1, 1, (len(samples), 4, samples.n_joints)))
+
+
+@pytest.mark.parametrize("index", [slice(1, 4), np.array([4, 0]), np.arange(6) > 3], ids=["slice", "indices", "mask"])
+def test_chosen_rows_keep_their_deflections(index: slice | np.ndarray) -> None:
+    samples = with_elements(table())
+    assert samples.deflections is not None
+    for found in (samples.rows(index).deflections, samples.motion()[index].deflections):
+        assert np.array_equal(found, samples.deflections[index])
+    assert table().rows(index).deflections is None
+
+
+def test_concatenation_keeps_deflections_that_all_parts_have() -> None:
+    parts = [with_elements(table(3), 1), with_elements(table(2), 2)]
+    joined = Samples.concatenate(parts).deflections
+    assert np.array_equal(joined, np.concatenate([part.deflections for part in parts]))
+    assert Samples.concatenate([parts[0], table(2)]).deflections is None
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_motion_is_read_back_from_its_array(known: bool) -> None:
+    motion = (with_elements(table()) if known else table()).motion()
+    arrays = motion.arrays()
+    assert arrays.shape == (6, 7 if known else 3, 2)
+    assert arrays.flags.c_contiguous
+    again = Motion.of(arrays)
+    for name in ("q", "dq", "ddq", "deflections"):
+        assert np.array_equal(getattr(again, name), getattr(motion, name))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -1,4 +1,4 @@
-"""Tests of dirty streams: LuGre friction, noise, encoder counts, rests and repetition."""
+"""Tests of dirty streams: friction of the drives, noise, encoder counts, rests and repetition."""
 
 from dataclasses import replace
 
@@ -6,13 +6,30 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from lipcore.robots.dirt import MIN_SIMULATION_HZ, SCALED_AMOUNTS, Dirt, draw_coloured_noise, simulate_lugre
+from lipcore.robots.dirt import (
+    MAXWELL_ELEMENTS,
+    MIN_SIMULATION_HZ,
+    SCALED_AMOUNTS,
+    Dirt,
+    DriveModel,
+    draw_coloured_noise,
+    simulate_lugre,
+    simulate_play,
+)
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import FAST_SPEED, PERIOD_S, Course, Simulation, simulate
+from lipcore.robots.simulation import FAST_SPEED, PERIOD_S, Course, Simulation, simulate, usual_torque
 from tests.lipcore.robots.test_simulation import assert_derivatives_match
 
 NO_DIRT = replace(Dirt().scaled(0.0), motion_hz=400.0)
 FINE_STREAM = Simulation(n_samples=2000, rate=MIN_SIMULATION_HZ, speed=FAST_SPEED, noise=0.0)
+ELASTIC_OR_NOT: tuple[DriveModel, ...] = ("lugre", "elastic")
+TORQUES = [
+    [2.2874694178468293, 1.02798221573284],
+    [2.400955250378086, 1.0497709869450045],
+    [2.175389153091892, 0.9843588813493938],
+    [1.723263224226527, 0.9170993732036267],
+    [1.1382779952245266, 0.8914957025954249],
+]
 
 
 @pytest.fixture(scope="module")
@@ -62,14 +79,69 @@ def test_zero_dirt_only_derives_motion_from_positions(robot: Robot) -> None:
         np.testing.assert_allclose(getattr(made, name)[inner], exact[inner], atol=0.01 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize("part", [name for name in SCALED_AMOUNTS if name != "encoder"])
+@pytest.mark.parametrize("part", [name for name in SCALED_AMOUNTS if name not in ("encoder", "spring")])
 def test_every_part_changes_the_torque(robot: Robot, part: str) -> None:
     friction = part in ("stiction", "load", "position", "warmth")  # parts of friction
     without = replace(NO_DIRT, friction=0.3) if friction else NO_DIRT
+    without = replace(without, viscous=0.3) if part == "viscous_warmth" else without
     dirts = without, replace(without, **{part: 0.3})
     less, more = (simulate(robot, replace(FINE_STREAM, dirt=dirt), 1).tau for dirt in dirts)
     added = np.std(more - less) / np.std(less)
     assert 0.005 < added < 1.0
+
+
+def test_friction_of_a_seed_never_changes(robot: Robot) -> None:
+    """Compare with torques from before there were other drives."""
+    made = simulate(robot, Simulation(5, 50.0, speed=FAST_SPEED, dirt=Dirt(seed=3)), 4)
+    np.testing.assert_allclose(made.tau, TORQUES, rtol=1e-9)
+
+
+def test_maxwell_drive_has_the_friction_of_its_coefficients(robot: Robot) -> None:
+    dirt = replace(NO_DIRT, friction=0.3, viscous=0.2, load=0.2, stiction=0.4, drive="maxwell")
+    clean, made = (simulate(robot, replace(FINE_STREAM, dirt=each), 1) for each in (NO_DIRT, dirt))
+    known = dirt.coefficients(usual_torque(robot))
+    exact = simulate(robot, FINE_STREAM, 1)  # without the low-pass of the velocities
+    sign = np.tanh(exact.dq / 0.02)
+    expected = known.viscous * exact.dq + (known.coulomb + known.load * np.abs(clean.tau)) * sign
+    for (width, _), torque in zip(MAXWELL_ELEMENTS, known.elements, strict=True):
+        deflection = np.zeros(2)
+        for k, step in enumerate(np.diff(exact.q, axis=0, prepend=exact.q[:1]) / width):
+            deflection = np.clip(deflection + step, -1, 1)
+            expected[k] += torque * deflection
+    np.testing.assert_allclose(made.tau - clean.tau, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+def test_play_is_spring_until_it_slips() -> None:
+    q = 0.02 * np.array([[0.0], [0.3], [1.0], [2.5], [2.0], [0.5], [0.0]])
+    np.testing.assert_allclose(simulate_play(q, 0.02)[:, 0], [0, 0.3, 1, 1, 0.5, -1, -1], atol=1e-12)
+
+
+def test_elastic_drive_measures_motors_behind_springs(robot: Robot) -> None:
+    stiff, soft = (replace(NO_DIRT, drive="elastic", spring=spring) for spring in (0.0, 0.01))
+    joints, motors = (simulate(robot, replace(FINE_STREAM, dirt=dirt), 1) for dirt in (stiff, soft))
+    np.testing.assert_array_equal(motors.tau, joints.tau)  # the spring carries the torque of the bodies
+    stretch, torque = motors.q - joints.q, joints.tau / usual_torque(robot)
+    ratio = (stretch * torque).sum(axis=0) / (torque**2).sum(axis=0)
+    assert ((ratio >= 0.005) & (ratio <= 0.015)).all()
+    np.testing.assert_allclose(stretch, ratio * torque, atol=1e-12)
+    assert_derivatives_match(motors, 0.02)
+    lugre, elastic = (
+        simulate(robot, replace(FINE_STREAM, dirt=replace(NO_DIRT, friction=0.3, spring=0.01, drive=drive)), 1).tau
+        for drive in ELASTIC_OR_NOT
+    )
+    assert np.abs(elastic - lugre).max() > 0.05 * np.abs(lugre).max()  # the motor turns back at another time
+
+
+def test_viscous_torque_falls_while_the_joint_warms_up(robot: Robot) -> None:
+    cold = replace(NO_DIRT, viscous=0.2, viscous_warmth=0.5, warm_s=1.0)
+    clean, warm, warming = (
+        simulate(robot, replace(FINE_STREAM, dirt=dirt), 1).tau
+        for dirt in (NO_DIRT, replace(cold, viscous_warmth=0.0), cold)
+    )
+    t = np.arange(len(clean)) / FINE_STREAM.rate
+    excess = ((warming - clean) / (warm - clean) - 1) / np.exp(-t)[:, None]
+    np.testing.assert_allclose(excess, excess[:1] + 0 * excess, rtol=1e-6)
+    assert ((excess >= 0.25) & (excess <= 0.75)).all()
 
 
 def test_positions_are_counts_at_any_rate(robot: Robot) -> None:
@@ -105,5 +177,7 @@ def test_invalid_dirt_is_rejected(robot: Robot) -> None:
         Dirt(friction=-1)
     with pytest.raises(ValueError, match="warm_s of the dirt is 0, expected a positive number"):
         Dirt(warm_s=0)
+    with pytest.raises(ValueError, match="drive is 'worm', expected one of lugre, maxwell, elastic"):
+        Dirt(drive="worm")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="course is 'circles', expected one of sinusoids, periodic, rests"):
         simulate(robot, Simulation(course="circles"), 0)  # type: ignore[arg-type]

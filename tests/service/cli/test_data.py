@@ -56,6 +56,11 @@ def test_simulated_recordings_are_read_back_unchanged(lipserve, tmp_path, ending
             "--samples 20 --rate 20 --course rests --dirt 0.5",
             {"rate": 20.0, "speed": 1.0, "course": "rests", "dirt": Dirt().scaled(0.5)},
         ),
+        (
+            "double-pendulum",
+            "--samples 20 --rate 20 --dirt 1 --drive maxwell",
+            {"rate": 20.0, "speed": 1.0, "dirt": Dirt(drive="maxwell")},
+        ),
     ],
 )
 def test_simulation_options_have_effect(lipserve, tmp_path, robot, options, expected):
