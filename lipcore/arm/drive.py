@@ -86,9 +86,8 @@ def choose_drive(problem: Problem, point: Point, rows: NDArray[np.int64], stop: 
     ]
     while open_kinds and not stop():
         trials = [(_fit_kind(best, point, kind), kind) for kind in open_kinds]
-        for trial, kind in sorted(trials, key=lambda each: each[0].value):
-            if best.value - trial.value < 0:
-                break
+        likely = [each for each in trials if each[0].value < best.value]
+        for trial, kind in sorted(likely, key=lambda each: each[0].value):
             chosen = _choose_joints(best, trial, point, kind, errors, blocks)
             if chosen is not None:
                 gain += best.value - chosen.fit.value

@@ -24,7 +24,7 @@ from lipcore.estimators import noise
 from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress
 from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Alternative, Arm, chain
-from lipcore.kernels.drive.terms import summary_rows
+from lipcore.kernels.drive.terms import passing_row
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.fast.play import POSITIONS
 from lipcore.kernels.geometry import Geometry
@@ -146,7 +146,7 @@ def learn(
         arm, params = _arm(found, order, mode)
         place, n = np.argsort(order), problem.n_joints
         friction = problem.weights(best)[problem.bodies :].reshape(n, -1)
-        misfit = misfit.with_friction(friction @ summary_rows(problem.drive.kinds)["coulomb"]).of_joints(place)
+        misfit = misfit.with_friction(friction @ passing_row(problem.drive.kinds)).of_joints(place)
         return ArmFit(arm, params, rows, problem.counts[:, place], misfit, report)
 
 

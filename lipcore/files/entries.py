@@ -55,6 +55,8 @@ class Friction(Entry):
     offset: Estimate
     stribeck: Estimate | UnsetType = UNSET
     load: Estimate | UnsetType = UNSET
+    breakaway: Estimate | UnsetType = UNSET
+    stiffness: Estimate | UnsetType = UNSET
 
 
 class BodyParameters(Entry):

@@ -13,7 +13,7 @@ from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.drive.kernel import DriveKernel
-from lipcore.kernels.drive.terms import summary_rows
+from lipcore.kernels.drive.terms import passing_row, summary_rows
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.plausible import is_plausible, nearest_plausible
 from lipcore.posterior.compact import CompactPosterior
@@ -62,7 +62,7 @@ class Friction:
     """Friction per torque that the bodies need; None if the model does not have it."""
     load_std: Array | None = None
     breakaway: Array | None = None
-    """Friction of a joint that begins to slip, N·m (N); None if friction does not remember where the joint came from."""
+    """Friction of a joint that begins to slip, N·m (N); None if friction remembers nothing."""
     breakaway_std: Array | None = None
     stiffness: Array | None = None
     """Stiffness of a joint that has turned back, before it slips, N·m/rad (N/m); None likewise."""
@@ -112,9 +112,7 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
 
     Raise ValueError for an estimator without friction.
     """
-    term = estimator.terms.get("friction")
-    if not isinstance(term, DriveKernel):
-        raise ValueError(f"estimator {estimator.name!r} has no friction term")
+    term = _drive_kernel(estimator)
     weights, n, f = weight_posterior(posterior, term), term.n_joints, len(term.drive.terms)
     mean, joints = weights.mean.reshape(n, f), np.arange(n)
     covariance = weights.covariance.reshape(n, f, n, f)[joints, :, joints]  # (n, f, f)
@@ -128,6 +126,16 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
         named[name] = np.einsum("nf,nf->n", mean, row)
         named[f"{name}_std"] = np.sqrt(np.maximum(np.einsum("nf,nfg,ng->n", row, covariance, row), 0.0))
     return Friction(**named)
+
+
+def passing_friction(posterior: Posterior, estimator: Estimator) -> Array:
+    """Return the Coulomb friction of each joint without the play elements, (n,) N·m (N).
+
+    Raise ValueError for an estimator without friction.
+    """
+    term = _drive_kernel(estimator)
+    mean = weight_posterior(posterior, term).mean.reshape(term.n_joints, -1)
+    return np.asarray(mean @ passing_row(term.drive.kinds))
 
 
 def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> InertialParameters:
@@ -252,6 +260,13 @@ def _report_arm(
             "joints": joints,
         },
     }
+
+
+def _drive_kernel(estimator: Estimator) -> DriveKernel:
+    term = estimator.terms.get("friction")
+    if not isinstance(term, DriveKernel):
+        raise ValueError(f"estimator {estimator.name!r} has no friction term")
+    return term
 
 
 def _arm_kernel(estimator: Estimator) -> ArmKernel:

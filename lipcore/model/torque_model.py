@@ -15,7 +15,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
-from lipcore.kernels.drive.play import with_deflections
+from lipcore.kernels.drive.play import ELEMENTS, with_deflections
 from lipcore.model import external
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
@@ -210,6 +210,10 @@ class TorqueModel:
         joints = query[0].shape[1]
         if joints != self.n_joints:
             raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
+        if deflections is not None:
+            expected = (len(query[0]), 2 * len(ELEMENTS), joints)
+            if deflections.shape != expected or not np.isfinite(deflections).all():
+                raise ValueError(f"deflections has shape {deflections.shape}, expected finite numbers, {expected}")
         mean, std, between, share = self.evaluator.many(*query, covariance, deflections)
         tau, fallback = mean, None
         if share is not None:

@@ -30,6 +30,10 @@ class MisfitOptions:
     """Variance of the torque that keeps a joint at rest, relative to its squared Coulomb torque. This value is that of
     a joint that stopped anywhere on a slow oscillation. It would be 1/3 if all such torques were equally likely, and 1
     if only the largest one occurred."""
+    stick_share: float = 0.1
+    """Variance of the torque of play elements at rest, relative to its square: a joint that stands still holds up to
+    half as much again as one that slips. Tuned on a simulated Panda with `Dirt` (seed 0), which had a coverage of 5 to
+    98 % at standstill without it and 100 % with it; with 0.05 it was 84 to 100 %."""
     speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     """Speeds below which friction may be unknown, rad/s (m/s)."""
     min_gain_nats: float = 10.0
@@ -99,11 +103,11 @@ class Misfit:
     def with_friction(self, coulomb: Array) -> Misfit:
         """Return this misfit for joints that stand still, with at least `rest_share` × `coulomb`² there, (n,) N·m.
 
-        The part of the play elements is known, and does not count. This also applies to joints that never moved.
+        coulomb: without the play elements, which are known except for `stick_share`. This also applies to joints that
+        never moved.
         """
-        if self.elements.size:
-            coulomb = np.maximum(np.abs(coulomb) - self.elements[0].sum(axis=0), 0.0)
-        return replace(self, still=np.maximum(OPTIONS.rest_share * coulomb**2 - self.rest, 0.0))
+        least = OPTIONS.rest_share * coulomb**2 + OPTIONS.stick_share * self.elements[0].sum(axis=0) ** 2
+        return replace(self, still=np.maximum(least - self.rest, 0.0))
 
     def with_rest(self, other: Misfit) -> Misfit:
         """Return this misfit, with the low speeds of another misfit for joints with a larger variance there."""

@@ -17,7 +17,7 @@ from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
 from lipcore.kernels.base import Params, SumKernel
 from lipcore.kernels.geometry import Geometry
-from lipcore.model.parameters import friction_coefficients
+from lipcore.model.parameters import passing_friction
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.compression import Compression, build_linear, compress_samples
@@ -128,7 +128,7 @@ def compact(
     misfit, _ = estimate_misfit(residual, contiguous.tau, moved, contiguous.episodes(), noise)
     if rigid is not None and estimator.name in ROBOT_ESTIMATORS:
         misfit = replace(misfit, elements=rigid.elements)
-    misfit = misfit.with_friction(friction_coefficients(posterior, estimator).coulomb)
+    misfit = misfit.with_friction(passing_friction(posterior, estimator))
     misfit = misfit if rigid is None else misfit.with_rest(rigid)
     motion = used.motion()
     variance = misfit.of_row(noise, motion, shared_rows(task.samples, task.joint_types, len(used)))

@@ -83,6 +83,12 @@ def drive_features(
     return np.stack(parts)
 
 
+def passing_row(kinds: Sequence[DriveKind]) -> Array:
+    """Return the row, (f,), of a joint's Coulomb friction without the play elements: it remembers nothing."""
+    row = summary_rows([kind for kind in kinds if kind != "play"])["coulomb"]
+    return np.pad(row, (0, len(drive_terms(kinds)) - len(row)))
+
+
 def summary_rows(kinds: Sequence[DriveKind]) -> dict[str, Array]:
     """Return the row, (f,), that turns a joint's coefficients into each number of a report.
 

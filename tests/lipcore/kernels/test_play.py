@@ -47,7 +47,7 @@ def test_deflections_follow_the_motion(start: float | None) -> None:
     t, q, dq = random_motion(800)
     state = PlayState.unknown(2)
     if start is not None:
-        state = PlayState(np.full((2, COUNT, 2), start), q[0], dq[0], t[0])
+        state = PlayState.at(t[0], q[0], dq[0], np.repeat([[start, start], [0.0, 0.0]], COUNT, axis=0))
     found, after = state.follow(t, q, dq, WIDTHS)
     for k in range(COUNT):
         for j in range(2):
@@ -55,9 +55,8 @@ def test_deflections_follow_the_motion(start: float | None) -> None:
             low, high = (deflect_slowly(q[:, j], WIDTHS[k, j], each) for each in starts)
             np.testing.assert_allclose(found[:, k, j], 0.5 * (low + high), atol=1e-9)
             np.testing.assert_allclose(found[:, COUNT + k, j], 0.5 * (high - low), atol=1e-9)
-            np.testing.assert_allclose(after.bounds[:, k, j], (low[-1], high[-1]), atol=1e-9)
-    assert np.array_equal(after.q, q[-1])
-    assert after.time == t[-1]
+            np.testing.assert_allclose(after.packed[5:].reshape(COUNT, 2, 2)[k, j], (low[-1], high[-1]), atol=1e-9)
+    assert np.array_equal(after.packed[:5], [t[-1], *q[-1], *dq[-1]])
 
 
 def test_parts_are_followed_like_the_whole() -> None:
@@ -68,7 +67,7 @@ def test_parts_are_followed_like_the_whole() -> None:
         found, state = state.follow(t[part], q[part], dq[part], WIDTHS)
         parts.append(found)
     assert np.array_equal(np.concatenate(parts), whole)
-    assert np.array_equal(state.bounds, end.bounds)
+    assert np.array_equal(state.packed, end.packed)
 
 
 def test_deflections_are_known_after_a_stroke_of_two_widths() -> None:

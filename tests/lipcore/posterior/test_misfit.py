@@ -66,8 +66,8 @@ def test_friction_at_standstill_is_unknown_at_standstill_alone() -> None:
     raised, still, moving = given.with_friction(np.full(3, 2.0)), np.zeros((1, 3)), np.full((1, 3), 0.2)
     np.testing.assert_allclose(at_rest(raised, still), [[2.0, 2.0, 4.0]])
     np.testing.assert_allclose(at_rest(raised, moving), at_rest(given, moving), atol=1e-12)
-    elements = np.ones((2, 5, 3))
-    np.testing.assert_allclose(replace(given, elements=0.2 * elements).with_friction(np.full(3, 2.0)).still[0], 0.5)
+    slipping = replace(given, elements=np.full((2, 5, 3), 0.6)).with_friction(np.full(3, 2.0))
+    np.testing.assert_allclose(slipping.still, [2.9, 2.89, 0.0])
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5])
