@@ -22,6 +22,10 @@
 
 using Joints = std::array<double, LIPSERVE_JOINTS>;
 
+struct Measured {
+    Joints q, dq;
+};
+
 struct Reference {
     Joints q, dq, ddq;
 };
@@ -40,6 +44,7 @@ public:
         for (std::size_t j = 0; j < joints.size(); j++)
             if (joints[j] != lipserve_joint_names[j])
                 return false;
+        lipserve_start(&state_);
         return true;
     }
 
@@ -52,12 +57,13 @@ public:
     }
 
     // One cycle. Sets the model's torque if the motion is in the training range and the torque certain enough, else
-    // zero, so that only the feedback acts. Returns whether the torque is used.
-    bool update(const Reference &reference, Joints &effort)
+    // zero, so that only the feedback acts. Returns whether the torque is used. dt: time since the last cycle, s.
+    bool update(const Measured &measured, const Reference &reference, double dt, Joints &effort)
     {
         Joints tau_std;
-        lipserve_torque_std_payload(reference.q.data(), reference.dq.data(), reference.ddq.data(),
-                                    has_payload_ ? &payload_ : nullptr, effort.data(), tau_std.data());
+        lipserve_update(&state_, measured.q.data(), measured.dq.data(), dt);
+        lipserve_torque_state(reference.q.data(), reference.dq.data(), reference.ddq.data(),
+                              has_payload_ ? &payload_ : nullptr, &state_, effort.data(), tau_std.data());
         bool certain = lipserve_in_range(reference.q.data(), reference.dq.data(), reference.ddq.data()) != 0;
         for (const double each : tau_std)
             certain = certain && each < max_std_; // false for NaN
@@ -70,6 +76,7 @@ private:
     double max_std_ = 1.0; // N m; choose it joint by joint for your robot
     bool has_payload_ = false;
     lipserve_payload payload_ = {};
+    lipserve_state state_ = {}; // friction remembers where each joint came from
 };
 
 // An example trajectory: sinusoids around a posture.
@@ -104,7 +111,9 @@ int main(int count, char **arguments)
         if (k == cycles / 2)
             controller.set_payload(&held);
         const auto before = steady_clock::now();
-        used += controller.update(desired(middle, 1e-3 * static_cast<double>(k)), effort);
+        const Reference reference = desired(middle, 1e-3 * static_cast<double>(k));
+        const Measured measured = {reference.q, reference.dq}; // read the joints' sensors here
+        used += controller.update(measured, reference, 1e-3, effort);
         longest = std::fmax(longest, duration<double, std::micro>(steady_clock::now() - before).count());
         // send the effort to the drives here, added to the feedback
     }

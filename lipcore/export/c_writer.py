@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -28,9 +29,11 @@ from lipcore.export.c_weights import (
     move_parameters,
 )
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, PlayState, element_widths
 from lipcore.kernels.drive.terms import SHAPE_SPEEDS, SIGN_WIDTH, STRIBECK_SPEED
-from lipcore.kernels.fast.answer import ACCELERATED
+from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
+from lipcore.kernels.fast.play import CERTAIN_SHARE
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.model.body import Body
@@ -41,7 +44,9 @@ SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
 WIDE = 8
 """Columns of a panel of the root."""
 VECTORS = 16
-"""Queries of the self-test, half of them with PAYLOAD."""
+"""Queries of the self-test, half of them with PAYLOAD. Every second one has a state after TRAIL."""
+TRAIL = (0.3, -0.5, 0.004, 0.0)
+"""Positions before a query, relative to its own, in units of the largest element. They deflect every element partly."""
 PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
 """Payload in half of the queries of the self-test."""
 
@@ -107,6 +112,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
     limits = [[model.training_range[name][end] for end in ("min", "max")] for name in ("q", "dq", "ddq")]
     body = PAYLOAD.inertia
     assert body is not None
+    misfit, elements = posterior.misfit.packed(), learnt.friction.drive.elements
     return {
         "n": str(n),
         "friction": str(rubbing.shape[1]),
@@ -124,6 +130,14 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "tip": _braced(axes_of(arm.geometry)[-1].T.reshape(-1)),
         "sign_width": repr(SIGN_WIDTH),
         "slow_speed": repr(STRIBECK_SPEED),
+        "elements": str(len(ELEMENTS)),
+        "loose": str((len(misfit) - MISFIT_ROWS) // 2),
+        "width": _braced(element_widths(model.joint_types)),
+        "usual": _braced(np.zeros(n) if elements is None else elements.acceleration),
+        "certain": repr(CERTAIN_SHARE),
+        "max_gap": repr(MAX_GAP_S),
+        "trail_size": str(len(TRAIL)),
+        "trail": _braced(TRAIL),
         "shapes": _braced(SHAPE_SPEEDS),
         "accelerated": repr(ACCELERATED),
         "quantile": repr(quantile(LEVEL)),
@@ -132,7 +146,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "share": share,
         "root": _braced(_panels(root)),
         **_rest(NonlinearTerm.of(posterior), shared),
-        "misfit": _braced(posterior.misfit.packed()),
+        "misfit": _braced(misfit),
         "floor": _braced(posterior.floor),
         "range": _braced(np.array(limits)),
         "payload": "{" + f"{PAYLOAD.mass!r}, {_braced(PAYLOAD.com)}, {_braced(body.reshape(-1))}" + "}",
@@ -231,16 +245,26 @@ def _vectors(model: TorqueModel, learnt: LinearWeights) -> Array:
     """Return queries within the training's range, and the model's own predictions: (VECTORS, 5, n)."""
     limits, draw, n = model.training_range, np.random.default_rng(0).uniform, model.n_joints
     motions = [draw(limits[name]["min"], limits[name]["max"], (VECTORS, n)) for name in ("q", "dq", "ddq")]
-    out = []
-    for rows, carried in ((slice(0, VECTORS // 2), False), (slice(VECTORS // 2, VECTORS), True)):
-        motion = [each[rows] for each in motions]
-        q, dq, ddq = motion
-        mean, std, *_ = (_add_payload(model, learnt) if carried else model).evaluator.many(q, dq, ddq)
+    out, half, widths = np.empty((VECTORS, 5, n)), VECTORS // 2, element_widths(model.joint_types)
+    for carried, known in product((False, True), repeat=2):
+        rows = slice(half * carried + known, half * (1 + carried), 2)
+        q, dq, ddq = motion = [each[rows] for each in motions]
+        before = _deflections_after_trail(q, widths) if known else None
+        evaluator = (_add_payload(model, learnt) if carried else model).evaluator
+        mean, std, *_ = evaluator.many(q, dq, ddq, deflections=before)
         more = np.zeros_like(mean)
         if carried:
             more = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).features(Motion(q, dq, ddq)) @ PAYLOAD.parameters
-        out.append(np.stack([*motion, mean + more, std], axis=1))
-    return np.concatenate(out)
+        out[rows] = np.stack([*motion, mean + more, std], axis=1)
+    return out
+
+
+def _deflections_after_trail(q: Array, widths: Array) -> Array:
+    """Return the deflections at N positions, (N, 2 K, n), each after TRAIL."""
+    time, still = np.full(len(TRAIL), 1e-3).cumsum(), np.zeros((len(TRAIL), q.shape[1]))
+    trails = q[:, None] + np.array(TRAIL)[:, None] * widths[-1]
+    start = PlayState.unknown(q.shape[1])
+    return np.stack([start.follow(time, each, still, widths)[0][-1] for each in trails])
 
 
 def _add_payload(model: TorqueModel, learnt: LinearWeights) -> TorqueModel:

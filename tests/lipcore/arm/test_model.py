@@ -68,7 +68,7 @@ def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> T
             turned.moved(0.1 * place * rng.standard_normal(found.geometry.size)) if place else found.geometry,
             found.parameters + 0.05 * place * random_bodies(n, place),
             0.01 * rng.random(n),
-            0.1 * rng.random((n, 3)),
+            0.1 * rng.random((n, len(found.friction.terms))),
             float(share),
         )
         for place, share in enumerate(shares)

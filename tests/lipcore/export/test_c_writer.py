@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,13 @@ import pytest
 from lipcore import FitOptions, TorqueModel, load, train
 from lipcore.arm.learning import learn
 from lipcore.data.motion import Motion
+from lipcore.data.samples import Samples
 from lipcore.estimators.catalogue import make_estimator
 from lipcore.estimators.task import Task
 from lipcore.export.c_weights import UnsupportedEstimatorError
 from lipcore.export.c_writer import HEADER, SOURCE, ModelOrigin, c_files
 from lipcore.kernels.base import PairKernel
+from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, PlayState, element_widths
 from lipcore.kernels.drive.terms import drive_terms
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
@@ -148,29 +151,45 @@ def train_with_correction(kinds: str, seed: int) -> TorqueModel:
 def with_misfit(model: TorqueModel) -> TorqueModel:
     """Return the model with every contribution to the variance."""
     rng, n = np.random.default_rng(0), model.n_joints
-    rows = np.stack([rng.uniform(0.1, 1.0, n), np.full(n, 0.1), *rng.uniform(0.5, 1.0, (3, n))])
+    rows = np.stack([rng.uniform(0.1, 1.0, n), np.full(n, 0.1), *rng.uniform(0.5, 1.0, (4, n))])
     misfit = Misfit.unpacked(rows)
     floor = np.array([1e-4, 10.0, *[1e-4] * (n - 2)])
     return replace(model, posterior=replace(model.posterior, misfit=misfit, floor=floor, std_factor=1.3))
 
 
+def predicted_samples(model: TorqueModel) -> Samples:
+    """Return samples of the model's own torque."""
+    motion, names = draw_motions(model, 100, 1), model.joint_names
+    tau, *_ = model.evaluator.many(*motion)
+    return Samples(names, 0.01 * np.arange(100), np.zeros(100, int), *motion, tau)
+
+
 def train_with_alternatives() -> TorqueModel:
-    _, _, robot = arm("RPR", 51)
-    return with_alternatives(train_arm("RPR", 51), record_motion(robot, 1, 100), 2)
+    model = train_arm("RPR", 51)
+    return with_alternatives(model, predicted_samples(model), 2)
 
 
-def train_with_drive(*kinds: DriveKind) -> TorqueModel:
-    """Train an arm with these kinds of friction."""
-    _, _, robot = arm("RRR", 50)
-    model, samples = train_arm("RRR", 50), record_motion(robot, 1, 100)
-    posterior = model.posterior
-    estimator = make_estimator("rigid-body", model.joint_types, arm=replace(model.arm, drive=kinds))
+def with_drive(model: TorqueModel, *kinds: DriveKind) -> TorqueModel:
+    """Return the model of an arm with these kinds of friction."""
+    rng, n, posterior, samples = np.random.default_rng(0), model.n_joints, model.posterior, predicted_samples(model)
+    samples = replace(samples, tau=samples.tau + rng.standard_normal(samples.tau.shape))
+    changed = replace(model.arm, drive=kinds, acceleration=rng.uniform(1.0, 5.0, n))
+    estimator = make_estimator("rigid-body", model.joint_types, arm=changed)
     widths = posterior.params["friction.log_std"]
     more = np.repeat(widths[:, 1:2], len(drive_terms(kinds)) - 3, axis=1)
     params = {**posterior.params, "friction.log_std": np.concatenate([widths, more], axis=1)}
+    misfit = replace(posterior.misfit, still=rng.uniform(0.1, 1.0, n))
+    if "play" in kinds:
+        elements = element_widths(model.joint_types)
+        misfit = replace(misfit, elements=np.stack([rng.uniform(0.1, 1.0, elements.shape), elements]))
     variance = np.broadcast_to(posterior.noise_variance, samples.tau.shape)
-    made = build_linear(estimator.kernel, params, samples, variance, 0.01, 1.0, posterior.misfit)
+    made = build_linear(estimator.kernel, params, samples, variance, 0.01, 1.0, misfit)
     return replace(model, estimator=estimator, posterior=made.posterior)
+
+
+def train_with_alternatives_and_drive() -> TorqueModel:
+    model = with_drive(train_arm("RPR", 51), *DRIVE_KINDS)
+    return with_alternatives(model, predicted_samples(model), 2)
 
 
 MODELS = {
@@ -180,8 +199,10 @@ MODELS = {
     "alternatives": train_with_alternatives,
     "fixed, from its tip": lambda: reversed_pendulum_model("fixed", OPTIONS),
     "calibrated, from its tip": lambda: reversed_pendulum_model("calibrate", OPTIONS),
-    "friction of slow joints": lambda: train_with_drive("stribeck"),
-    "friction of all kinds": lambda: train_with_drive(*DRIVE_KINDS),
+    "friction of slow joints": lambda: with_drive(train_arm("RRR", 50), "stribeck"),
+    "friction of all kinds": lambda: with_drive(train_arm("RRR", 50), *DRIVE_KINDS),
+    "friction of all kinds, alternatives": train_with_alternatives_and_drive,
+    "play, from its tip": lambda: with_drive(reversed_pendulum_model("fixed", OPTIONS), "play"),
     "misfit": lambda: with_misfit(train_arm("RRR", 50)),
     "energies": lambda: with_misfit(train_with_energies("RRR", 50)),
     "local": lambda: train_with_correction("RPR", 51),
@@ -207,12 +228,107 @@ def test_compiled_numbers_match_the_model(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(std[:few], deviation, rtol=1e-9)
 
 
+class CompiledState:
+    """A state in a compiled library, and the torque that follows from it."""
+
+    def __init__(self, path: Path, n: int) -> None:
+        size = ctypes.c_double * (n * (2 * len(ELEMENTS) + 2))
+        self._library = ctypes.CDLL(str(path))
+        self._state = type("State", (ctypes.Structure,), {"_fields_": [("numbers", size), ("known", ctypes.c_int)]})()
+        self._library.lipserve_start(ctypes.byref(self._state))
+
+    @property
+    def numbers(self) -> list[float]:
+        return list(self._state.numbers)
+
+    def update(self, q: np.ndarray, dq: np.ndarray, dt: float) -> None:
+        self._library.lipserve_update(ctypes.byref(self._state), c_array(q), c_array(dq), ctypes.c_double(dt))
+
+    def evaluate(self, motion: np.ndarray, is_used: bool = True) -> np.ndarray:
+        """Return mean and standard deviation of a query, (2, n), and check the mean alone. motion: (3, n)."""
+        query, state = [c_array(row) for row in motion], ctypes.byref(self._state) if is_used else None
+        alone, out = np.empty_like(motion[0]), np.empty_like(motion[:2])
+        self._library.lipserve_torque_state(*query, None, state, *map(c_array, out))
+        self._library.lipserve_torque_state(*query, None, state, c_array(alone), None)
+        np.testing.assert_array_equal(alone, out[0])
+        return out
+
+
+def turning_motion(model: TorqueModel, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) and motions (3, N, n) with turns, stops, gaps, steps and a clock that is set back."""
+    rng, n = np.random.default_rng(3), model.n_joints
+    dt = rng.uniform(0.001, 0.02, count)
+    dt[[50, 90, 130, 170]] = 1.01 * MAX_GAP_S, 0.99 * MAX_GAP_S, -0.1, 0.0
+    time = np.cumsum(dt)
+    dq = 0.3 * np.sin(np.cumsum(rng.uniform(0.0, 0.3, (count, n)), axis=0)) * (rng.random((count, n)) < 0.7)
+    moved = 0.5 * (dq[1:] + dq[:-1]) * dt[1:, None] + 1e-4 * rng.standard_normal((count - 1, n))
+    moved[[29, 69], n - 1] += 1.01 * element_widths(model.joint_types)[-1, -1], 0.9 * ELEMENTS[0]
+    q = np.concatenate([np.zeros((1, n)), moved]).cumsum(axis=0)
+    return time, np.stack([q, dq, 10 * rng.standard_normal((count, n))])
+
+
+PLAY_MODELS = ("friction of all kinds, alternatives", "friction of all kinds", "play, from its tip")
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", few(PLAY_MODELS, kept=lambda name: name == PLAY_MODELS[0]))
+def test_state_follows_the_motion(name: str, tmp_path: Path) -> None:
+    model = MODELS[name]()
+    state = CompiledState(compile_library(c_files(model, ORIGIN), tmp_path), model.n_joints)
+    time, motion = turning_motion(model, 400)
+    widths = element_widths(model.joint_types)
+    deflections, _ = PlayState.unknown(model.n_joints).follow(time, *motion[:2], widths)
+    followed = np.empty((2, *motion.shape[1:]))
+    for k, dt in enumerate(np.diff(time, prepend=time[0])):
+        state.update(*motion[:2, k], dt)
+        followed[:, k] = state.evaluate(np.ascontiguousarray(motion[:, k]))
+    expected, tau_std, *_ = model.evaluator.many(*motion, deflections=deflections)
+    np.testing.assert_allclose(followed[0], expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(followed[1], tau_std, rtol=1e-9)
+    unaware, wider, *_ = model.evaluator.many(*motion)
+    assert (np.abs(unaware - expected) > 1e-3).any()
+    assert (wider > 1.1 * tau_std).any()
+
+
+@needs_compiler
+def test_state_is_unknown_after_a_number_that_is_not_finite(tmp_path: Path) -> None:
+    model = MODELS["play, from its tip"]()
+    state = CompiledState(compile_library(c_files(model, ORIGIN), tmp_path), 2)
+    query = np.array([[0.1, 0.2], [0.5, -0.5], [0.0, 0.0]])
+    without = state.evaluate(query, is_used=False)
+    np.testing.assert_array_equal(state.evaluate(query), without)
+    state.update(query[0], query[1], 0.001)
+    first = state.evaluate(query)
+    assert (first[1] > 1.01 * without[1]).all()
+    for place, wrong in product((0, 1), (np.nan, np.inf)):
+        state.update(query[0] + 0.01, query[1], 0.001)
+        assert (state.evaluate(query)[1] < first[1]).all()
+        broken = query[:2].copy()
+        broken[place, 1] = wrong
+        state.update(*broken, 0.001)
+        np.testing.assert_array_equal(state.evaluate(query), without)
+        state.update(query[0], query[1], 0.001)
+        np.testing.assert_array_equal(state.evaluate(query), first)
+
+
+@needs_compiler
+def test_models_without_play_ignore_the_state(tmp_path: Path) -> None:
+    model = load(PANDA)
+    state = CompiledState(compile_library(c_files(model, ORIGIN), tmp_path), 7)
+    query = np.ascontiguousarray(draw_motions(model, 1, 1)[:, 0])
+    for step in (0.0, 0.01):
+        state.update(query[0] + step, query[1], 0.001)
+        np.testing.assert_array_equal(state.evaluate(query), state.evaluate(query, is_used=False))
+    assert not any(state.numbers)
+
+
 @needs_compiler
 @pytest.mark.parametrize(
     "name",
     [
         "panda",
         *map(slow, ("prismatic", "alternatives", "fixed, from its tip", "energies", "local", "friction of all kinds")),
+        slow("friction of all kinds, alternatives"),
     ],
 )
 @pytest.mark.parametrize("body", [BODY, Body(0.7, np.array([0.1, 0.2, -0.3]))], ids=["body", "point"])
@@ -250,8 +366,27 @@ def test_self_test_detects_a_changed_number(name: str, between: tuple[str, str],
 
 @pytest.mark.slow
 @needs_compiler
+def test_self_test_detects_a_changed_state(tmp_path: Path) -> None:
+    files = c_files(MODELS["friction of all kinds"](), ORIGIN)
+    text = files[SOURCE]
+    changes = {
+        "lower[e][k] + step": "lower[e][k] - step",
+        "upper[e][k] + step": "upper[e][k]",
+        "0.5 * (state->lower": "0.501 * (state->lower",
+        "0.001, 0.001, 0.001}": "0.001, 0.00101, 0.001}",
+    }
+    for k, (right, wrong) in enumerate(changes.items()):
+        assert right in text
+        path = compile_library({**files, SOURCE: text.replace(right, wrong, 1)}, tmp_path / str(k))
+        assert ctypes.CDLL(str(path)).lipserve_selftest() > 0, wrong
+
+
+@pytest.mark.slow
+@needs_compiler
 @pytest.mark.parametrize(
-    "make", [train_with_alternatives, lambda: train_with_energies("RPR", 51)], ids=["alternatives", "energies"]
+    "make",
+    [train_with_alternatives, lambda: train_with_energies("RPR", 51), train_with_alternatives_and_drive],
+    ids=["alternatives", "energies", "friction"],
 )
 def test_code_has_no_mutable_state(make: Callable[[], TorqueModel], tmp_path: Path) -> None:
     """The object has no writable data and calls only five functions of libm."""
@@ -269,7 +404,10 @@ MAIN = '#include "lipserve_model.h"\nint main(void) { return lipserve_selftest()
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["gcc", slow("clang")])
-@pytest.mark.parametrize("name", ["panda", slow("alternatives"), slow("energies of a prismatic joint")])
+@pytest.mark.parametrize(
+    "name",
+    ["panda", *map(slow, ("alternatives", "friction of all kinds, alternatives", "energies of a prismatic joint"))],
+)
 def test_compilers_and_sanitizers_report_nothing(name: str, compiler: str, tmp_path: Path) -> None:
     if shutil.which(compiler) is None:
         pytest.skip(f"needs {compiler}, which is not installed")
