@@ -6,7 +6,7 @@ largest gain in evidence is added, if
 - it gains at least `min_nats`, with several terms `min_nats_of_several`, for all joints or for those that are predicted
   better with it, and
 - blocks of the recording are predicted better from the other blocks, beyond their scatter, and
-- friction does not fall with the load, beyond doubt.
+- friction does not fall with the load, nor play elements push a joint, beyond doubt.
 
 The evidence alone trusts a recording in which joints move together too much; held-out blocks do not.
 """
@@ -49,7 +49,8 @@ class DriveOptions:
     min_deviations: float = 1.0
     """Min mean gain over the blocks, the logarithm of the squared error, in its standard deviations."""
     max_doubt: float = 2.0
-    """Standard deviations below zero at which a coefficient of the load is implausible."""
+    """Standard deviations below zero at which a coefficient of the load, or the sum of the play elements, is
+    implausible."""
 
 
 OPTIONS = DriveOptions()
@@ -129,7 +130,7 @@ def _choose_joints(
         fewer = _fit_kind(best, point, kind, joints)
         if fewer.value < trial.value:
             trial, wider = fewer, held_out_errors(fewer.problem, fewer.point, blocks)
-    supported = best.value - trial.value >= _min_nats(kind) and not _falls_with_load(trial.problem, trial.point)
+    supported = best.value - trial.value >= _min_nats(kind) and not _is_implausible(trial.problem, trial.point)
     both = (np.exp(np.log(each).mean(axis=1)) for each in (errors, wider))
     return _Chosen(trial, wider) if supported and _is_better(*both) else None
 
@@ -162,13 +163,17 @@ def held_out_errors(problem: Problem, point: Point, blocks: NDArray[np.int64]) -
     return np.array(out)
 
 
-def _falls_with_load(problem: Problem, point: Point) -> bool:
-    """Return whether the friction of a joint falls with the load, beyond doubt."""
-    terms = list(problem.drive.terms)
-    if "load" not in terms:
-        return False
-    places = problem.bodies + terms.index("load") + len(terms) * np.arange(problem.n_joints)
+def _is_implausible(problem: Problem, point: Point) -> bool:
+    """Return whether a joint's friction falls with the load, or its play elements push it, beyond doubt."""
+    n, terms = problem.n_joints, problem.drive.terms
     covariance = cho_solve((point.factor, True), np.eye(len(problem.scale)), check_finite=False)
-    deviation = np.sqrt(covariance.diagonal()[places])
-    used = problem.used[:, terms.index("load")]
-    return bool((point.weights[places] < -OPTIONS.max_doubt * deviation)[used].any())
+    covariance = covariance[problem.bodies :, problem.bodies :] * np.outer(*2 * [problem.scale[problem.bodies :]])
+    weights = problem.weights(point)[problem.bodies :].reshape(n, -1)
+    for summed in (["load"], KIND_TERMS["play"]):
+        row = np.array([float(term in summed) for term in terms])
+        for joint in np.flatnonzero(problem.used @ row):
+            places = len(terms) * joint + np.arange(len(terms))
+            deviation = np.sqrt(row @ covariance[np.ix_(places, places)] @ row)
+            if weights[joint] @ row < -OPTIONS.max_doubt * deviation:
+                return True
+    return False
