@@ -53,12 +53,12 @@ def combine_torques(
     in its uncertainty. motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
     """
     n, size, count = kernel.n_joints, len(motions), len(motions[0])
-    stacked = [np.stack([getattr(m, name) for m in motions], axis=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
+    stacked = np.stack([motion.arrays() for motion in motions], axis=1)  # (N, S, 3, n), or with deflections
     # right-hand sides are whitened together: enough for fast matrix products, few enough for tens of MB
     step = max(1, 512 // (size * n))
     means, stds = [], []
     for start in range(0, count, step):
-        stack = Motion(*(part[start : start + step].reshape(-1, n) for part in stacked))
+        stack = Motion.of(stacked[start : start + step].reshape(-1, *stacked.shape[2:]))
         queries = len(stack) // size
         cross = posterior.cross(kernel, stack)  # (M, queries S n)
         cross = cross.reshape(-1, size * n) @ coefficients.T

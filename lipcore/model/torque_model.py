@@ -15,7 +15,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
-from lipcore.kernels.drive.play import ELEMENTS, with_deflections
+from lipcore.kernels.drive.play import ELEMENTS, PlayState, element_widths, with_deflections
 from lipcore.model import external
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
@@ -197,7 +197,7 @@ class TorqueModel:
             dq: Velocities, same shape, rad/s (m/s).
             ddq: Accelerations, same shape, rad/s² (m/s²).
             covariance: Whether to compute the covariance between the joints.
-            deflections: Deflections of the play elements, (N, 2 K, n); see `lipcore.kernels.drive.play`.
+            deflections: Deflections of the play elements, (N, 2 K, n); see `deflections_along`.
 
         Returns:
             Torques, standard deviations and, if requested, covariances; see `TorquePrediction`.
@@ -232,6 +232,15 @@ class TorqueModel:
         if known is None and self.remembers and samples.n_joints == self.n_joints:
             known = with_deflections(samples, self.joint_types).deflections
         return self.predict(samples.q, samples.dq, samples.ddq, covariance, known)
+
+    def deflections_along(self, t: Array, q: Array, dq: Array) -> Array | None:
+        """Return the deflections along one motion, (N, 2 K, n) as in `Motion`; None if the model does not remember.
+
+        The motion before the first row is unknown. t: (N,) s, in order of time; q, dq: (N, n).
+        """
+        if not self.remembers:
+            return None
+        return PlayState.unknown(self.n_joints).follow(t, q, dq, element_widths(self.joint_types))[0]
 
     @property
     def remembers(self) -> bool:

@@ -13,7 +13,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.repetition import measure_distinct_share
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
-from lipcore.kernels.drive.play import deflections_at
+from lipcore.kernels.drive.play import deflections_of
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
 
@@ -127,8 +127,7 @@ class Misfit:
         out = out + self.still * np.exp(-((motion.dq / SIGN_WIDTH) ** 2))
         if self.elements.size:
             torque, widths = self.elements
-            known = motion.deflections
-            known = deflections_at(motion.dq, motion.ddq, widths, self.acceleration) if known is None else known
+            known = deflections_of(motion, widths, self.acceleration)
             out = out + np.square((torque * known[:, len(widths) :]).sum(axis=1))
         return np.asarray(out)
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
 from lipcore.data.outliers import MAX_TORQUE
 from service.foundation.errors import ServiceError
-from service.foundation.fields import MAX_NAMES, numbers, rows_of_numbers
+from service.foundation.fields import MAX_NAMES, list_of_numbers, rows_of_numbers
 
 CONTACT_THRESHOLD = (3.0, 100.0)
 """Bounds of the contact threshold, standard deviations. Below 3, ordinary errors of a good model would be rejected.
@@ -89,18 +89,15 @@ StreamId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 SequenceNumber = Annotated[int, Field(strict=True, ge=0, le=MAX_SEQUENCE)]
 
 
-def _to_times(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
-    """Return one number or numbers (N,) as an array (N,), null as NaN; raise InvalidRequestError."""
-    return np.array(numbers(info.field_name or "value", value if isinstance(value, list) else [value], nullable=True))
-
-
 _Numbers = list[Annotated[float | None, WithJsonSchema({"type": ["number", "null"]})]]
 Matrix = Annotated[
     NDArray[np.float64],
     PlainValidator(rows_of_numbers(nullable=True), json_schema_input_type=_Numbers | list[_Numbers]),
 ]
 """JSON array of shape (N, n), or (n,) for one row; null for a missing number."""
-Times = Annotated[NDArray[np.float64], PlainValidator(_to_times, json_schema_input_type=float | _Numbers)]
+Times = Annotated[
+    NDArray[np.float64], PlainValidator(list_of_numbers(nullable=True), json_schema_input_type=float | _Numbers)
+]
 """JSON array of shape (N,), or a number for one row."""
 
 

@@ -20,12 +20,14 @@ from service.contract.models import AliasName, Evaluation, VersionNumber
 from service.contract.payload import Payload
 from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
-from service.foundation.fields import MAX_NAME_CHARS, check_unique, rows_of_numbers
+from service.foundation.fields import MAX_NAME_CHARS, check_unique, list_of_numbers, rows_of_numbers
 
 Vectors = Annotated[
     NDArray[np.float64], PlainValidator(rows_of_numbers(), json_schema_input_type=list[float] | list[list[float]])
 ]
 """JSON array of shape (n,) for one query or (N, n) for a batch."""
+Times = Annotated[NDArray[np.float64], PlainValidator(list_of_numbers(), json_schema_input_type=float | list[float])]
+"""JSON array of shape (N,), or a number for one query."""
 
 
 ComponentNames = Annotated[
@@ -71,6 +73,25 @@ MinRevision = Annotated[
 ]
 
 
+_BEFORE = "history."
+_EarlierTimes = Annotated[
+    NDArray[np.float64], PlainValidator(list_of_numbers(within=_BEFORE), json_schema_input_type=list[float])
+]
+_EarlierRows = Annotated[
+    NDArray[np.float64], PlainValidator(rows_of_numbers(within=_BEFORE), json_schema_input_type=list[list[float]])
+]
+
+
+class History(BaseModel):
+    """Motion before the first row of a query: at most 1000 rows in order of time."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
+
+    t: _EarlierTimes = Field(description="Times, s, by the clock of the request's `t`: (N), rising")
+    q: _EarlierRows = Field(description="Positions, rad (prismatic: m): (N, n)")
+    dq: _EarlierRows = Field(description="Velocities, rad/s (m/s): (N, n)")
+
+
 class PredictRequest(VersionChoice):
     """One query or a batch of queries, in SI units."""
 
@@ -100,6 +121,20 @@ class PredictRequest(VersionChoice):
         "others `friction`. They cost several times as much as a torque, so the max batch size is smaller",
     )
     tau: Vectors | None = Field(None, description="Torque for `forward_dynamics`, N·m (prismatic: N)")
+    t: Times | None = Field(
+        None, description="Times, s: (N), rising; a number for one query. For `trajectory` and `history` only"
+    )
+    trajectory: bool = Field(
+        False,
+        description="The rows of the batch are one motion in order of time. Friction that remembers the motion before "
+        "a state then follows the rows. By default each row is a query alone: the motion before it is unknown, and "
+        "`tau_std` is larger at low speed. Models without such friction ignore this",
+    )
+    history: History | None = Field(
+        None,
+        description="Motion before the query, or before the first row of a trajectory. It counts as unknown if it ends "
+        "more than 0.25 s earlier",
+    )
     min_revision: MinRevision = None
     payload: Payload | None = Field(
         None,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo
 
-from service.foundation.errors import invalid_request
+from service.foundation.errors import InvalidRequestError, invalid_request
 
 MAX_NAME_CHARS, MAX_NAMES = 200, 1000
 """Max characters of a name; and max entries of a list of names, or of a list with one number per joint."""
@@ -60,12 +60,24 @@ def numbers(name: str, row: list[Any], nullable: bool = False) -> list[float]:
     return out
 
 
-def rows_of_numbers(nullable: bool = False) -> Callable[[Any, ValidationInfo], NDArray[np.float64]]:
+ToArray = Callable[[Any, ValidationInfo], NDArray[np.float64]]
+
+
+def rows_of_numbers(nullable: bool = False, within: str = "") -> ToArray:
     """Return a validator that turns numbers (n,) or rows of numbers (N, n) into an array.
 
-    nullable: see `numbers`.
+    nullable: see `numbers`. within: path to the field in errors, such as `history.`.
     """
-    return lambda value, info: _to_array(info.field_name or "value", value, nullable)
+    return lambda value, info: _to_array(f"{within}{info.field_name}", value, nullable)
+
+
+def list_of_numbers(nullable: bool = False, within: str = "") -> ToArray:
+    """Return a validator that turns one number or numbers (N,) into an array (N,); see `rows_of_numbers`."""
+
+    def validate(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
+        return np.array(numbers(f"{within}{info.field_name}", value if isinstance(value, list) else [value], nullable))
+
+    return validate
 
 
 def check_unique(names: list[Any]) -> list[Any]:
@@ -96,6 +108,10 @@ def _to_array(name: str, value: Any, nullable: bool) -> NDArray[np.float64]:
     if not isinstance(value[0], list):
         return np.array(numbers(name, value, nullable))
     width = len(value[0])
+    if set(map(type, value)) == {list} and set(map(len, value)) == {width}:
+        with suppress(InvalidRequestError):  # the loop below names its place
+            flat = [number for row in value for number in row]
+            return np.array(numbers(name, flat, nullable)).reshape(len(value), width)
     rows = []
     for index, row in enumerate(value):
         if not isinstance(row, list) or len(row) != width:

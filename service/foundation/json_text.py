@@ -10,6 +10,8 @@ from service.foundation.fields import first_repeat
 
 MAX_FIELDS = 1000
 """Max fields of a JSON object."""
+_OPEN, _CLOSE = b"{}"
+_NO_BRACES = bytes(set(range(256)) - {_OPEN, _CLOSE})
 
 
 def read_json(body: bytes) -> Any:
@@ -34,8 +36,21 @@ def has_unique_fields(body: bytes) -> bool:
     """Return True if valid JSON surely repeats no field; False means that `read_json` has to check."""
     if b"\\" in body:
         return False
-    quoted = body.split(b'"')[1::2]
-    return len(set(quoted)) == len(quoted)
+    pieces = body.split(b'"')
+    quoted = pieces[1::2]
+    if len(set(quoted)) == len(quoted):
+        return True
+    objects: list[set[bytes]] = []
+    for between, text in zip(pieces[::2], quoted, strict=False):
+        for brace in between.translate(None, _NO_BRACES):
+            if brace == _OPEN:
+                objects.append(set())
+            else:
+                objects.pop()
+        if not objects or text in objects[-1]:
+            return False
+        objects[-1].add(text)
+    return True
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

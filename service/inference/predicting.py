@@ -19,13 +19,15 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import ROBOT_ESTIMATORS, ComponentName
 from service.contract.decoding import HotDecoder, struct_of
 from service.contract.payload import Payload
-from service.contract.predictions import PredictRequest, PredictResponse
+from service.contract.predictions import History, PredictRequest, PredictResponse
 from service.foundation.errors import invalid_request
 from service.models.loaded import LoadedModels, ServedModel
 
 Array = NDArray[np.float64]
 MAX_BATCH, MAX_COMPONENT_BATCH = 1000, 100
 """Maximum queries of one prediction request, and of one with components."""
+MAX_HISTORY = 1000
+"""Maximum rows of the motion before a query."""
 QUANTITIES = ("q", "dq", "ddq", "tau")
 FORWARD: ComponentName = "forward_dynamics"
 
@@ -34,11 +36,12 @@ class Query(NamedTuple):
     """Motions of a torque query, from JSON, tensors or a frame.
 
     `values` contains q, dq, ddq and, if needed, tau: (3 or 4, N, n) in SI units. If `single`, the request was one query
-    without a query axis, and so is its answer.
+    without a query axis, and so is its answer. `within` is the path to these fields, such as `history.`.
     """
 
     values: Array
     single: bool
+    within: str = ""
 
     def check(self, limits: Array, expected: Callable[[str], str] = lambda _: "a finite number") -> None:
         """Raise InvalidRequestError if a number is not finite or a position exceeds ±`limits`, (n,) rad (m).
@@ -55,15 +58,17 @@ class Query(NamedTuple):
             within = f"radians (or metres) within ±{limits[joint]:g}: are these degrees?"
             raise invalid_request(self._name("q", row, joint), f"{self.values[0, row, joint]:g}", within)
 
-    def components(self, model: TorqueModel, names: Sequence[ComponentName]) -> dict[str, Estimate]:
+    def components(
+        self, model: TorqueModel, names: Sequence[ComponentName], deflections: Array | None = None
+    ) -> dict[str, Estimate]:
         """Return estimates of dynamics components by name, (N, …) each; torque is used by forward dynamics alone.
 
-        Raise InvalidRequestError if an inertia matrix cannot be inverted.
+        deflections: as in `Motion`. Raise InvalidRequestError if an inertia matrix cannot be inverted.
         """
         parts = self.values if FORWARD in names else self.values[:3]
         q, dq, ddq, *tau = parts
         try:
-            return dynamics.components(model, Motion(q, dq, ddq), names, *tau)
+            return dynamics.components(model, Motion(q, dq, ddq, deflections), names, *tau)
         except dynamics.IndefiniteInertiaError as error:
             raise invalid_request(
                 "q" if self.single else f"q[{error.index}]",
@@ -72,24 +77,34 @@ class Query(NamedTuple):
             ) from error
 
     def _name(self, name: str, row: np.intp, joint: np.intp) -> str:
-        return f"{name}[{joint}]" if self.single else f"{name}[{row}][{joint}]"
+        return f"{self.within}{name}[{joint}]" if self.single else f"{self.within}{name}[{row}][{joint}]"
 
 
-def check_shapes(request: Any, model: TorqueModel) -> list[Array]:
-    """Return the arrays q, dq, ddq and tau of a request without those that are None.
+def check_shapes(request: Any, model: TorqueModel, within: str = "") -> list[Array]:
+    """Return the arrays q, dq, ddq and tau of a request without those that are None or that it does not have.
 
-    Raise InvalidRequestError if their shapes differ or do not match the model's joints.
+    Raise InvalidRequestError if their shapes differ or do not match the model's joints. within: see `Query`.
     """
-    parts = {name: values for name in QUANTITIES if (values := getattr(request, name)) is not None}
+    parts = {name: values for name in QUANTITIES if (values := getattr(request, name, None)) is not None}
     for name, values in parts.items():
+        field = f"{within}{name}"
         if values.shape[-1] != model.n_joints:
             given, names = values.shape[-1], ", ".join(model.joint_names)
-            message = f"`{name}` has {given} values; this model has {model.n_joints} joints: {names}."
-            raise invalid_request(name, f"{given} values", f"{model.n_joints} values: {names}", message)
+            message = f"`{field}` has {given} values; this model has {model.n_joints} joints: {names}."
+            raise invalid_request(field, f"{given} values", f"{model.n_joints} values: {names}", message)
         if values.shape != request.q.shape:
-            message = f"`{name}` has shape {values.shape}; `q` has shape {request.q.shape}."
-            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}", message)
+            message = f"`{field}` has shape {values.shape}; `{within}q` has shape {request.q.shape}."
+            expected = f"the shape of {within}q, {request.q.shape}"
+            raise invalid_request(field, f"of shape {values.shape}", expected, message)
     return list(parts.values())
+
+
+def check_times(request: Any, rows: int, within: str = "") -> None:
+    """Raise InvalidRequestError unless there is a time `t` for each of the rows. within: see `Query`."""
+    given, field = len(request.t), f"{within}t"
+    if given != rows:
+        message = f"`{field}` has {given} values; `{within}q` has {rows} rows."
+        raise invalid_request(field, f"{given} values", f"{rows} values, one for each row", message)
 
 
 def check_answer(name: str, values: Array) -> None:
@@ -150,6 +165,70 @@ def model_with_payload(served: ServedModel, payload: Payload | None) -> TorqueMo
         raise invalid_request(f"payload.{name}", payload.model_dump(mode="json")[name], text) from error
 
 
+def known_deflections(request: PredictRequest, query: Query, model: TorqueModel, limits: Array) -> Array | None:
+    """Return the deflections of a query by the motion before its rows, (N, 2 K, n) as in `Motion`.
+
+    Return None if the motion before them is unknown or the model does not remember it. Raise InvalidRequestError if
+    `t`, `trajectory` or `history` is wrong. limits: see `Query.check`.
+    """
+    _check_order(request, query.single)
+    if request.t is None:
+        return None
+    rows = query.values.shape[1]
+    check_times(request, rows)
+    _check_rising(request.t, "t")
+    motion = [request.t, query.values[0], query.values[1]]
+    if request.history is not None:
+        before = _read_history(request.history, model, limits)
+        start, end = request.t[0], before[0][-1]
+        if start <= end:
+            message = f"`t` begins at {start:.9g}; it must be after {end:.9g}, the end of the history."
+            raise invalid_request("t[0]", f"{start:.9g}", f"a time after {end:.9g}, the end of the history", message)
+        motion = [np.concatenate(parts) for parts in zip(before, motion, strict=True)]
+    deflections = model.deflections_along(*motion)
+    return None if deflections is None else deflections[-rows:]
+
+
+def _check_order(request: PredictRequest, single: bool) -> None:
+    """Raise InvalidRequestError if `t`, `trajectory` and `history` do not belong together."""
+    ordered, history = request.trajectory, request.history is not None
+    if ordered and single:
+        message = "`trajectory` needs a batch of rows in order of time; this is one query."
+        raise invalid_request("trajectory", "true", "false for one query", message)
+    if history and not (ordered or single):
+        message = "`history` of a batch needs `trajectory`: true. Otherwise each row is a query alone."
+        raise invalid_request("history", "given", "no history, or a trajectory", message)
+    if request.t is None and (ordered or history):
+        message = "`t` is required for `trajectory` and `history`."
+        raise invalid_request("t", "missing", "times of the rows, s", message)
+    if request.t is not None and not (ordered or history):
+        message = "`t` is used only for `trajectory` and `history`."
+        raise invalid_request("t", "given", "no t, or a trajectory or history", message)
+
+
+def _read_history(history: History, model: TorqueModel, limits: Array) -> tuple[Array, Array, Array]:
+    """Return t, q and dq of the motion before a query; raise InvalidRequestError."""
+    within, rows, given = "history.", len(history.q), history.q.shape
+    if rows > MAX_HISTORY:
+        raise invalid_request("history.q", f"{rows} rows", f"at most {MAX_HISTORY}")
+    if len(given) == 1:
+        message = f"`history.q` has shape {given}; it must be a list of rows."
+        raise invalid_request("history.q", f"of shape {given}", "rows of positions, (N, n)", message)
+    Query(np.stack(check_shapes(history, model, within)), False, within).check(limits)
+    check_times(history, rows, within)
+    _check_rising(history.t, "history.t")
+    return history.t, history.q, history.dq
+
+
+def _check_rising(t: Array, field: str) -> None:
+    """Raise InvalidRequestError for the first of the times (N,) that is not after the one before."""
+    wrong = np.flatnonzero(t[1:] <= t[:-1])
+    if len(wrong):
+        last = int(wrong[0])
+        expected = f"a time after {field}[{last}], {t[last]:.9g}"
+        raise invalid_request(f"{field}[{last + 1}]", f"{t[last + 1]:.9g}", expected)
+
+
 queries: HotDecoder[PredictRequest] = HotDecoder(PredictRequest)
 _Response: Callable[..., Struct] = struct_of(PredictResponse)
 _encoder = msgspec.json.Encoder()
@@ -159,6 +238,8 @@ def one_motion(query: Any) -> Array | None:
     """Return the motion (3, n) of a decoded query; None if it requests more than the torque of one motion."""
     batch = bool(query.q) and isinstance(query.q[0], list)
     if batch or query.covariance or query.components or query.tau is not None:
+        return None
+    if query.history is not None or query.t is not None or query.trajectory:
         return None
     try:
         return np.array((query.q, query.dq, query.ddq), np.float64)
@@ -206,11 +287,13 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
     count = query.values.shape[1]
     check_count("q", f"{count} queries", count, bool(request.components))
-    query.check(served.model.position_limits(loaded.storage.settings.max_position))
-
+    limits = served.model.position_limits(loaded.storage.settings.max_position)
+    query.check(limits)
     known = model_with_payload(served, request.payload)
+    deflections = known_deflections(request, query, known, limits)
+
     q, dq, ddq, *_ = query.values
-    answer = known.predict(q, dq, ddq, request.covariance)
+    answer = known.predict(q, dq, ddq, request.covariance, deflections)
     arrays = {"tau": answer.tau, "tau_std": answer.tau_std}
     if answer.covariance is not None:
         arrays["covariance"] = answer.covariance
@@ -223,7 +306,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
         lists[name] = shaped.tolist()
     if request.components:
         of_query = 0 if single else slice(None)
-        estimates = query.components(known, request.components)
+        estimates = query.components(known, request.components, deflections)
         lists["components"] = {
             name: {part: getattr(estimates[name], part)[of_query].tolist() for part in ("mean", "std")}
             for name in request.components

@@ -9,8 +9,8 @@ After a stroke of 2 r in one direction e is ±1, wherever it was before. Until t
 follow the same rule and begin at −1 and 1. The expected deflection is their middle. Its standard deviation is half of
 their distance: a joint that has stopped may have slipped in either direction.
 
-If one instant alone is known, its velocity v and acceleration a tell where the joint comes from. With the usual
-acceleration u and A² = a² + (0.1 u)²,
+If one instant alone is known, or it is more certain, its velocity v and acceleration a tell where the joint comes from.
+With the usual acceleration u and A² = a² + (0.1 u)²,
 
     e = clip(s − a / A, −1, 1),    s = v |v| / (2 A r)
 
@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.motion import Array
+from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
 from lipcore.kernels.fast.play import CERTAIN_SHARE, POSITIONS, follow
 
@@ -109,6 +109,18 @@ def with_deflections(samples: Samples, joint_types: Sequence[str]) -> Samples:
     state = PlayState.unknown(samples.n_joints)
     deflections, _ = state.follow(samples.t, samples.q, samples.dq, element_widths(joint_types), begins)
     return replace(samples, deflections=deflections)
+
+
+def deflections_of(motion: Motion, widths: Array, acceleration: Array) -> Array:
+    """Return the deflections of N instants, (N, 2 K, n): those of the motion before, or of the instant if more certain.
+
+    widths: (K, n); acceleration: usual one, (n,).
+    """
+    alone = deflections_at(motion.dq, motion.ddq, widths, acceleration)
+    if motion.deflections is None:
+        return alone
+    certain = np.tile(motion.deflections[:, len(widths) :] <= alone[:, len(widths) :], (1, 2, 1))
+    return np.where(certain, motion.deflections, alone)
 
 
 def deflections_at(dq: Array, ddq: Array, widths: Array, acceleration: Array) -> Array:

@@ -56,19 +56,26 @@ def follow(
 
 @inlined
 def expected_deflection(motion: Array, joint: int, k: int, elements: Array) -> float:
-    """Return the expected deflection of an element. elements: (K + 1, n), widths and usual acceleration."""
-    if motion.shape[0] > POSITIONS:
+    """Return the expected deflection of an element. elements: (K + 1, n), widths and usual acceleration.
+
+    It is that of the motion before, unless the instant alone is more certain.
+    """
+    count, known = elements.shape[0] - 1, motion.shape[0] > POSITIONS
+    if known and motion[POSITIONS + count + k, joint] == 0.0:
         return motion[POSITIONS + k, joint]
     velocity, pushed = motion[1, joint], motion[2, joint]
-    size = np.hypot(pushed, CERTAIN_SHARE * elements[elements.shape[0] - 1, joint])
+    size = np.hypot(pushed, CERTAIN_SHARE * elements[count, joint])
     stroke = 0.5 * velocity * abs(velocity) / (size * elements[k, joint])
+    if known and motion[POSITIONS + count + k, joint] <= np.exp(-0.5 * abs(stroke)):
+        return motion[POSITIONS + k, joint]
     return min(max(stroke - pushed / size, -1.0), 1.0)
 
 
 @inlined
 def deflection_std(motion: Array, joint: int, k: int, count: int, width: float, acceleration: float) -> float:
     """Return the standard deviation of an element's deflection, 0 to 1. count: number of elements."""
-    if motion.shape[0] > POSITIONS:
-        return motion[POSITIONS + count + k, joint]
+    known = motion[POSITIONS + count + k, joint] if motion.shape[0] > POSITIONS else 1.0
+    if known == 0.0:
+        return 0.0
     size = np.hypot(motion[2, joint], CERTAIN_SHARE * acceleration)
-    return np.exp(-0.25 * motion[1, joint] ** 2 / (size * width))
+    return min(known, np.exp(-0.25 * motion[1, joint] ** 2 / (size * width)))

@@ -28,7 +28,7 @@ from service.contract.observations import (
 )
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
-from service.inference.predicting import check_shapes
+from service.inference.predicting import check_shapes, check_times
 from service.journal import log
 from service.journal.arrivals import NewBatch, check_kind, is_forgotten
 from service.journal.log import StreamHistory
@@ -146,9 +146,8 @@ def validate_batch(request: ObservationRequest, model: TorqueModel) -> MeasuredR
     rows = 1 if request.q.ndim == 1 else len(request.q)
     if rows > MAX_ROWS:
         raise invalid_request("q", f"{rows} rows", f"at most {MAX_ROWS} in one batch")
-    if request.t is not None and request.t.shape != (rows,):
-        message = f"`t` has {len(request.t)} values; `q` has {rows} rows."
-        raise invalid_request("t", f"{len(request.t)} values", f"{rows} values, one for each row", message)
+    if request.t is not None:
+        check_times(request, rows)
     if request.t is None and request.ddq is None:
         message = "`ddq` is required unless `t` is given."
         raise invalid_request("ddq", "missing", "accelerations, or times `t` to derive them", message)

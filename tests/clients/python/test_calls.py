@@ -54,6 +54,16 @@ def test_names_are_quoted_and_paths_match_the_given_names():
     assert calls.inference.model_ready("m", 2).path == "/v2/models/m/versions/2/ready"
 
 
+def test_predict_sends_rows_with_times_as_a_trajectory():
+    history = (0, [0.1], [0.2])  # of one row
+    one = calls.inference.predict("m", [0.0], [0.0], [0.0], t=1, history=history).json
+    assert (one["t"], one.get("trajectory")) == (1.0, None)
+    assert one["history"] == {"t": [0.0], "q": [[0.1]], "dq": [[0.2]]}
+    rows = calls.inference.predict("m", *[[[0.0]] * 2] * 3, t=[0.0, 0.5]).json
+    assert (rows["t"], rows["trajectory"]) == ([0.0, 0.5], True)
+    assert not {"t", "trajectory", "history"} & calls.inference.predict("m", *[[[0.0]] * 2] * 3).json.keys()
+
+
 LOST = httpx.ReadError("lost")
 MODEL = {"name": "m", "created_at": "now", "latest_version": 1, "serving_version": 1, "aliases": {}, "versions": []}
 

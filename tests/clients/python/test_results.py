@@ -14,6 +14,7 @@ from lipserve.results.evaluation import read_evaluation
 from lipserve.results.series import LiveRows, read_live
 from tests.clients.python.conftest import over
 from tests.lipcore.arms import parameters_of
+from tests.lipcore.remembering import remembering_model, remembering_samples
 from tests.service.data import stream, upload
 from tests.service.models.versions import JOINTS, panda, publish
 
@@ -52,6 +53,29 @@ def test_predictions_are_arrays(api, local):
     for level in (0.0, 1.0, 95):
         with pytest.raises(ValueError, match="expected a probability"):
             one.interval(level)
+
+
+def test_times_and_a_history_make_one_motion(api, local):
+    publish(api, "remembers", remembering_model())
+    samples = remembering_samples(seed=8, size=60)
+    motion, row = (samples.q, samples.dq, samples.ddq), 30
+    expected = remembering_model().predict_along(samples)
+    whole = local.predict("remembers", *motion, t=samples.t)
+    later, single = (
+        local.predict(
+            "remembers",
+            *(each[rows] for each in motion),
+            t=samples.t[rows],
+            history=(samples.t[:row], samples.q[:row], samples.dq[:row]),
+        )
+        for rows in (slice(row, None), row)
+    )
+    for found, rows in ((whole, slice(None)), (later, slice(row, None)), (single, row)):
+        np.testing.assert_allclose(found.tau, expected.tau[rows], rtol=1e-9)
+        np.testing.assert_allclose(found.tau_std, expected.tau_std[rows], rtol=1e-9)
+    one = (samples.t[row - 1], samples.q[row - 1], samples.dq[row - 1])  # a history of one row
+    after_one = local.predict("remembers", *(each[row] for each in motion), t=samples.t[row], history=one)
+    assert (after_one.tau_std > single.tau_std).all()
 
 
 def test_evaluation_prints_as_a_table():

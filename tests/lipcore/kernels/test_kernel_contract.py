@@ -18,7 +18,7 @@ from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.base import LinearKernel, PairKernel, State, SumKernel, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.drive.kernel import DriveKernel
-from lipcore.kernels.drive.play import ELEMENTS, deflections_at, element_widths
+from lipcore.kernels.drive.play import ELEMENTS, deflections_of, element_widths
 from lipcore.kernels.drive.terms import drive_features, drive_terms
 from lipcore.kernels.fast.lanes import LANES
 from lipcore.kernels.geometry import Geometry
@@ -88,9 +88,8 @@ def arm_features(arm: Arm, motion: Motion) -> Array:
 
 def drive_terms_of(arm: Arm, kinds: Sequence[DriveKind], motion: Motion) -> Array:
     """Return the terms of friction with the torque of an arm's bodies as the load, (f, N, n)."""
-    load, known = np.abs(bodies_torque(arm.geometry, arm.order, arm.parameters, motion)), motion.deflections
-    if known is None:
-        known = deflections_at(motion.dq, motion.ddq, element_widths(arm.joint_types), arm.acceleration)
+    load = np.abs(bodies_torque(arm.geometry, arm.order, arm.parameters, motion))
+    known = deflections_of(motion, element_widths(arm.joint_types), arm.acceleration)
     return drive_features(motion.dq, kinds, load, known[:, : len(ELEMENTS)])
 
 

@@ -33,6 +33,7 @@ from tests.lipcore.oracles import (
     torque_terms,
     with_full_counts,
 )
+from tests.lipcore.remembering import remembering_model, remembering_samples
 
 
 class Setting(NamedTuple):
@@ -347,3 +348,15 @@ def test_friction_matches_the_dense_posterior(small_model: SmallModel, row: int)
     )
     friction = dynamics.components(small_model.model, small_model.query, ["friction"])["friction"]
     assert_estimate(friction, row, *expected)
+
+
+def test_components_follow_the_deflections_of_a_motion() -> None:
+    model, samples = remembering_model(), remembering_samples(seed=8, size=60)
+    known = samples.deflections
+    np.testing.assert_array_equal(model.deflections_along(samples.t, samples.q, samples.dq), known)
+    motion = samples.motion()
+    tau = model.predict(motion.q, motion.dq, motion.ddq, deflections=known).tau
+    parts = dynamics.components(model, motion, ("inertial", "coriolis", "gravity", "friction"))
+    np.testing.assert_allclose(sum(each.mean for each in parts.values()), tau, rtol=1e-6, atol=1e-9)
+    found = dynamics.components(model, motion, ["forward_dynamics"], tau)["forward_dynamics"].mean
+    np.testing.assert_allclose(found, motion.ddq, atol=1e-6 * np.abs(motion.ddq).max())

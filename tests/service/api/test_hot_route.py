@@ -20,6 +20,7 @@ from tests.service.data import DEADLINE, error, service_of
 
 QUERY = {"q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2.0, 3e-1]}
 BATCH = {name: [values, values[::-1], [0.5, 0]] for name, values in QUERY.items()}
+HISTORY = {"t": [0], "q": [[0.25, -1.5]], "dq": [[1, 0.125]]}
 
 
 def post(api, model, body, media_type="application/json"):
@@ -45,9 +46,14 @@ def no_thread(api, monkeypatch):
 
 def test_single_query_is_answered_on_the_event_loop(no_thread, trained):
     service_of(no_thread).loaded.get(trained.name, None)  # models of other tests may have replaced it in memory
-    for body in (QUERY, QUERY | {"version": 1}, QUERY | {"components": [], "covariance": False, "tau": None}):
+    for body in (
+        QUERY,
+        QUERY | {"version": 1},
+        QUERY | {"components": [], "covariance": False, "tau": None, "t": None},
+    ):
         assert post(no_thread, trained.name, body).status_code == 200
-    for body in (BATCH, QUERY | {"covariance": True}, QUERY | {"components": ["gravity"]}):
+    history = {"t": 0.01, "history": HISTORY}
+    for body in (BATCH, QUERY | {"covariance": True}, QUERY | {"components": ["gravity"]}, QUERY | history):
         with pytest.raises(AssertionError, match="computed in a thread"):
             post(no_thread, trained.name, body)
 
@@ -72,6 +78,9 @@ def test_numbers_equal_the_model_bit_for_bit(api, trained):
         BATCH | {"covariance": True, "components": ["friction", "gravity"]},
         QUERY | {"components": ["forward_dynamics"], "tau": [0.1, 0]},
         QUERY | {"version": None, "tau": None},
+        BATCH | {"t": [0, 0.01, 0.02], "trajectory": True, "components": ["friction"]},
+        QUERY | {"t": 0.01, "history": HISTORY},
+        QUERY | {"t": None, "trajectory": False, "history": None},
         json.dumps(QUERY).encode("utf-8-sig"),
         f" \n{json.dumps(QUERY, indent=3)}\t",
         '{"\\u0071": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
@@ -101,6 +110,9 @@ def test_correct_queries_are_answered_alike(api, trained, body):
         '{"q": [9, 9], "\\u0071": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1]}',
         '{"q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2e0, 3E-1], "version": 1, "version": null}',
         QUERY | {"version": 2},
+        QUERY | {"t": 0.5},
+        QUERY | {"t": 0.01, "history": HISTORY | {"dq": [[None, 0]]}},
+        QUERY | {"t": 0.01, "history": HISTORY | {"ddq": [[0, 0]]}},
         QUERY | {"dq": [1e200, 0]},
         BATCH | {"dq": [[0, 0], [0, 1e200], [0, 0]]},
         {name: [values] * 1001 for name, values in QUERY.items()},

@@ -73,6 +73,10 @@ def test_duplicates_are_found_in_linear_time():
 
 def test_fields_are_counted_once():
     assert has_unique_fields(b'{"q": [0], "dq": [0]}')
+    assert has_unique_fields(b'{"q": [0], "more": {"q": [0], "{": {"q": {}}}, "dq": [0]}')
+    assert not has_unique_fields(b'{"q": [0], "more": {"q": [0], "dq": {"dq": 1}, "q": 2}}')
+    assert not has_unique_fields(b'{"q": [0], "more": {"dq": {"q": {}}}, "q": 2}')
+    assert not has_unique_fields(b'["q", "q"]')
     for repeated in (b'"dq": [0], "q": 0', b'"\\u0071": [0]', b'"alias": "q"'):  # the last is ambiguous
         assert not has_unique_fields(b'{"q": [0], ' + repeated + b"}")
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from service.api.routes.observations import batches
 from service.contract.decoding import HotDecoder
@@ -23,6 +23,8 @@ MORE = {
         {"payload": {"mass": 1, "com": [0, 0, 0.1]}},
         {"version": None, "alias": None, "tau": None, "payload": None, "components": []},
         {name: [[0, 1], [2, 3e-1]] for name in ("q", "dq", "ddq")},
+        {"t": [0, 0.5], "trajectory": True, "history": None},
+        {"t": 2, "history": {"t": [0, 1.5], "q": [[0, 1], [2, 3]], "dq": [[0.5, 0.25], [0, 0]]}},
     ],
     ObservationRequest: [
         {"t": None, "ddq": None},
@@ -37,6 +39,7 @@ TEXTS = """
     [0.1] [[0.1]] [[0,1],[2]] [[0,1],2] [0,[1]] [[[0]]] [1e400] [NaN] [[0,null]] [[],[]] ["gravity"]
     ["gravity","gravity"] ["gravity","heat"] {"mass":1} {"mass":1,"com":[0,0]} {"mass":0,"com":[0,0,0]}
     {"mass":1,"mass":2,"com":[0,0,0]} {"mass":1,"com":[0,0,0],"q":1} {"mass":true,"com":[0,0,0]}
+    {"t":[0],"q":[[0]],"dq":[[1]]} {"t":[0],"q":[[0]],"dq":[[1,null]]} {"t":[0],"q":[[0]],"dq":[[1]],"t":[1]}
 """
 """Values that are correct for some fields and wrong for most."""
 
@@ -60,7 +63,9 @@ def assert_same(decoded, expected):
     assert decoded.keys() == expected.keys()
     for name, value in expected.items():
         assert type(decoded[name]) is type(value)
-        if isinstance(value, np.ndarray):
+        if isinstance(value, BaseModel):
+            assert_same(vars(decoded[name]), vars(value))
+        elif isinstance(value, np.ndarray):
             assert (decoded[name].dtype, decoded[name].shape) == (value.dtype, value.shape)
             assert decoded[name].tobytes() == value.tobytes()
         else:

@@ -39,6 +39,8 @@ def predict(
     alias: str | None = None,
     min_revision: int | None = None,
     payload: Mapping[str, ArrayLike] | None = None,
+    t: ArrayLike | None = None,
+    history: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
 ) -> Call[Prediction]:
     """Predict torques and their standard deviations at one or N motions.
 
@@ -56,6 +58,9 @@ def predict(
             for it and answers 503 if that takes too long.
         payload: `mass`, kg; `com`, (3,) m, in the frame of the last link; optional `inertia`, (3, 3) kg·m², about
             the centre of mass (default: a point mass).
+        t: Times, s: (N,) if the rows are one motion in order of time, which friction that remembers then follows; or
+            one number for one motion with a history. Default: each row is a query alone.
+        history: Motion before the first row: times (M,) by the same clock, positions (M, n), velocities (M, n).
 
     Returns:
         The prediction, shaped as q.
@@ -66,11 +71,17 @@ def predict(
     Example:
         >>> answer = client.predict("panda-sim", [0.0] * 7, [0.0] * 7, [0.0] * 7)
         >>> lower, upper = answer.interval(0.95)
+        >>> rows = client.predict("panda-sim", q, dq, ddq, t=t, history=(t_before, q_before, dq_before))
     """
     body: dict[str, Any] = {"covariance": covariance, "components": list(components)}
-    for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
+    for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau), ("t", t)):
         if values is not None:
             body[name] = np.asarray(values, dtype=np.float64).tolist()
+    if t is not None and np.ndim(q) > 1:
+        body["trajectory"] = True
+    if history is not None:
+        parts = zip(("t", "q", "dq"), history, (1, 2, 2), strict=True)
+        body["history"] = {name: np.array(values, np.float64, ndmin=axes).tolist() for name, values, axes in parts}
     if payload is not None:
         body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
     body |= given(version=version, alias=alias, min_revision=min_revision)

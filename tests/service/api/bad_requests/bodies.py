@@ -74,6 +74,15 @@ def with_payload(name: str, *values: Any, named: str | None = None) -> list[BadR
     return with_value(PREDICT, QUERY, "payload", *wrong, named=named or f"payload.{name}")
 
 
+TIMED = QUERY | {"t": 0.0}
+
+
+def with_history(name: str, *values: Any, named: str | None = None) -> list[BadRequest]:
+    """Return queries whose history has one wrong value each."""
+    wrong = ({"t": [-2.0, -1.0], "q": [ZERO] * 2, "dq": [ZERO] * 2, name: value} for value in values)
+    return with_value(PREDICT, TIMED, "history", *wrong, named=named or f"history.{name}")
+
+
 DIAGONAL = [[1, 0, 0], [0, 1, 0]]
 NO_OBJECTS = [
     *(body(PREDICT, text, "body") for text in TEXTS),
@@ -114,6 +123,18 @@ PREDICTING = [
     *with_payload("inertia", [*DIAGONAL, [0, 0]], named="payload.inertia[2]"),
     *with_payload("inertia", [*DIAGONAL, [0, 0, NAN]], named="payload.inertia[2][2]"),
     *with_payload("colour", "red"),
+    *with_value(PREDICT, QUERY, "t", 0.5, []),
+    *with_value(PREDICT, QUERY, "t", "0", [None], True, NAN, 10**400, [[0.0]], named="t[0]"),
+    *with_value(PREDICT, QUERY, "trajectory", True, 1, "true", None),
+    *with_value(PREDICT, TIMED, "history", 5, [], "2"),
+    *with_history("t", [], [0.0]),
+    *with_history("t", "0", [None, 0.0], named="history.t[0]"),
+    *with_history("t", [-1.0, -1.5], named="history.t[1]"),
+    *with_history("q", ZERO, [[0.0] * 6] * 2, [], None),
+    *with_history("dq", [ZERO], [ZERO] * 3, 0.0),
+    *with_history("dq", [ZERO, ZERO[1:]], named="history.dq[1]"),
+    *with_history("q", [ZERO, first_wrong(NAN)[0]], [ZERO, first_wrong(90.0)[0]], named="history.q[1][0]"),
+    *with_history("ddq", [ZERO, ZERO]),
 ]
 TRAINING = [
     *with_value(JOBS, JOB, "model", "A", *ODD, None, 5),
