@@ -15,6 +15,7 @@ from service.foundation.settings import Settings
 from service.models.loads import StreamPayload, StreamPayloads
 from service.models.scales import Factor, Scales
 from service.telemetry.meters import Meters
+from tests.lipcore.remembering import remembering_model, remembering_samples
 from tests.service.data import DEADLINE
 from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, FALLBACK, SCALE, STD, frame, read
 
@@ -22,7 +23,7 @@ from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, FALLBACK, SCALE
 class FakeModel:
     """A model whose torque is q times a factor and whose standard deviation is the factor."""
 
-    joint_names, torque_convention = ("a", "b"), "gravity_included"
+    joint_names, torque_convention, remembers = ("a", "b"), "gravity_included", False
 
     def __init__(self, factor=1.0):
         self.factor = factor
@@ -110,6 +111,24 @@ def test_versions_dropped_from_memory_serve_their_streams(versions, pinned, vers
     result = answer_frame(stream_session)
     assert (result.version, result.tau.tolist(), loaded.loads, len(texts)) == (version, tau, version - 1, version - 1)
     assert '"version": 2' in "".join(texts) or version == 1
+
+
+def test_frames_of_a_session_are_one_motion():
+    """Friction remembers where a joint came from, across versions, until the client is silent."""
+    model, samples = remembering_model(), remembering_samples(seed=8, size=200)
+    loaded, expected = FakeVersions(v1=model, v2=model), model.predict_along(samples)
+    alone = model.predict(samples.q, samples.dq, samples.ddq)
+    last = int(np.abs(alone.tau - expected.tau).max(axis=1).argmax())
+    assert np.abs(alone.tau[last] - expected.tau[last]).max() > 0.1
+    stream_session, _ = make_session(loaded, 1)
+    motions = samples.motion().arrays()[:, :3]
+    for row in range(last + 1):
+        loaded.latest = 1 if row < last // 2 else 2
+        answer = answer_frame(stream_session, frame(motions[row]), samples.t[row])
+        np.testing.assert_allclose((answer.tau, answer.std), (expected.tau[row], expected.tau_std[row]), rtol=1e-9)
+    for another, arrived in ((stream_session, samples.t[last] + 1.0), (make_session(loaded, 1)[0], samples.t[last])):
+        answer = answer_frame(another, frame(motions[last]), arrived)
+        np.testing.assert_allclose((answer.tau, answer.std), (alone.tau[last], alone.tau_std[last]), rtol=1e-9)
 
 
 def test_answer_includes_the_current_scale_of_its_stream():
