@@ -7,6 +7,7 @@ alone. So every part is a sum or difference of torques at a few motions, with an
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -113,9 +114,9 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
         raise IndefiniteInertiaError(int(np.argmin(lowest > 0)))
     friction, ddq = model.estimator.terms.get("friction"), np.zeros_like(motion.q)
     for _ in range(LOAD_STEPS if isinstance(friction, DriveKernel) and "load" in friction.drive.kinds else 1):
-        left = tau - posterior.mean(Motion(motion.q, motion.dq, ddq))
+        left = tau - posterior.mean(replace(motion, ddq=ddq))
         ddq = ddq + np.linalg.solve(inertia, left[:, :, None])[:, :, 0]
-    covariance = posterior.predict(Motion(motion.q, motion.dq, ddq)).covariance
+    covariance = posterior.predict(replace(motion, ddq=ddq)).covariance
     half = np.linalg.solve(inertia, covariance)  # M⁻¹ Σ
     variance = np.linalg.solve(inertia, half.mT).diagonal(axis1=1, axis2=2)
     return Estimate(ddq, np.sqrt(variance.clip(0.0)))

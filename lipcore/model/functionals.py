@@ -50,15 +50,17 @@ def combine_torques(
     """Return the posterior of F linear combinations of a kernel's torques at S motions per query, (N, F).
 
     It is computed from the joint posterior of all S n torques. What they have in common cancels in a difference, also
-    in its uncertainty. motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
+    in its uncertainty. motions: S motions of N queries each, with deflections in all or none; coefficients: (F, S n),
+    motion by motion.
     """
     n, size, count = kernel.n_joints, len(motions), len(motions[0])
-    stacked = [np.stack([getattr(m, name) for m in motions], axis=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
+    names = ["q", "dq", "ddq"] + ["deflections"] * (motions[0].deflections is not None)
+    stacked = [np.stack([getattr(m, name) for m in motions], axis=1) for name in names]  # (N, S, …, n)
     # right-hand sides are whitened together: enough for fast matrix products, few enough for tens of MB
     step = max(1, 512 // (size * n))
     means, stds = [], []
     for start in range(0, count, step):
-        stack = Motion(*(part[start : start + step].reshape(-1, n) for part in stacked))
+        stack = Motion(*(part[start : start + step].reshape(-1, *part.shape[2:]) for part in stacked))
         queries = len(stack) // size
         cross = posterior.cross(kernel, stack)  # (M, queries S n)
         cross = cross.reshape(-1, size * n) @ coefficients.T

@@ -55,15 +55,18 @@ class Query(NamedTuple):
             within = f"radians (or metres) within ±{limits[joint]:g}: are these degrees?"
             raise invalid_request(self._name("q", row, joint), f"{self.values[0, row, joint]:g}", within)
 
-    def components(self, model: TorqueModel, names: Sequence[ComponentName]) -> dict[str, Estimate]:
+    def components(
+        self, model: TorqueModel, names: Sequence[ComponentName], deflections: Array | None = None
+    ) -> dict[str, Estimate]:
         """Return estimates of dynamics components by name, (N, …) each; torque is used by forward dynamics alone.
 
+        deflections: those of the play elements, if known, (N, 2 K, n).
         Raise InvalidRequestError if an inertia matrix cannot be inverted.
         """
         parts = self.values if FORWARD in names else self.values[:3]
         q, dq, ddq, *tau = parts
         try:
-            return dynamics.components(model, Motion(q, dq, ddq), names, *tau)
+            return dynamics.components(model, Motion(q, dq, ddq, deflections), names, *tau)
         except dynamics.IndefiniteInertiaError as error:
             raise invalid_request(
                 "q" if self.single else f"q[{error.index}]",
