@@ -24,6 +24,7 @@ from service.api.limits.requests import MAX_REQUESTS, PATIENCE, BodyLimit, Gate,
 from service.api.metrics import System, Traffic
 from service.api.oip import routes as oip
 from service.api.oip import rpc
+from service.api.oip.sequences import Sequences
 from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
 from service.api.routes import (
     audit,
@@ -209,6 +210,7 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -
         "training": lambda lasting: check_queue(jobs, lasting),
     }
     state.storage, state.loaded, state.jobs, state.learners = storage, loaded, jobs, learners
+    state.sequences = Sequences()
     state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))
     state.readiness = Readiness(probes, state.stopping)
     state.collectors = (

@@ -50,7 +50,8 @@ def combine_torques(
     """Return the posterior of F linear combinations of a kernel's torques at S motions per query, (N, F).
 
     It is computed from the joint posterior of all S n torques. What they have in common cancels in a difference, also
-    in its uncertainty. motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
+    in its uncertainty. motions: S motions of N queries each, with deflections in all or none; coefficients: (F, S n),
+    motion by motion.
     """
     n, size, count = kernel.n_joints, len(motions), len(motions[0])
     stacked = np.stack([motion.arrays() for motion in motions], axis=1)  # (N, S, 3, n), or with deflections

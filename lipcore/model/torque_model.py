@@ -15,7 +15,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
-from lipcore.kernels.drive.play import ELEMENTS, PlayState, element_widths, with_deflections
+from lipcore.kernels.drive.play import ELEMENTS, PlayFollower, PlayState, element_widths, with_deflections
 from lipcore.model import external
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
@@ -273,6 +273,8 @@ class TorqueModel:
     def warm_up(self) -> None:
         """Compile or load everything that the first prediction needs."""
         self.evaluator.warm_up()
+        if self.remembers:
+            PlayFollower(element_widths(self.joint_types)).step(0.0)
         external.warm_up()
 
     @cached_property

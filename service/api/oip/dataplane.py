@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from time import perf_counter
 
 from anyio import CapacityLimiter
 
@@ -11,6 +12,7 @@ from lipcore.model.torque_model import TorqueModel
 from service.api.limits.requests import in_turn
 from service.api.oip import query, schema
 from service.api.oip.query import shapes
+from service.api.oip.sequences import Sequences
 from service.api.oip.tensors import Message
 from service.api.route import Reply
 from service.contract.models import ALIAS
@@ -45,6 +47,7 @@ async def ready(loaded: LoadedModels, turns: CapacityLimiter, name: str, version
 
 async def infer(
     loaded: LoadedModels,
+    sequences: Sequences,
     turns: CapacityLimiter,
     name: str,
     version: str | None,
@@ -55,12 +58,12 @@ async def infer(
 
     `decode` decodes the body, which has `size` bytes. Raise ServiceError for a wrong request.
     """
-    settings = loaded.storage.settings
+    settings, arrived = loaded.storage.settings, perf_counter()
     served = await find(loaded, turns, name, version)
     if size > MAX_INLINE_BYTES:
-        return await in_turn(turns, query.infer, served, decode, settings)
+        return await in_turn(turns, query.infer, served, decode, settings, sequences, arrived)
     message = decode()
-    task = query.read_task(served, message, settings)
+    task = query.read_task(served, message, settings, sequences, arrived)
     if task.is_inline:
         return query.respond(served, message, task)
     return await in_turn(turns, query.respond, served, message, task)

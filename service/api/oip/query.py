@@ -13,6 +13,7 @@ from lipcore.model.external import external
 from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePrediction
 from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.api.oip import schema
+from service.api.oip.sequences import Sequences, read_part
 from service.api.oip.tensors import Answer, Header, Message
 from service.api.route import Reply
 from service.foundation.errors import invalid_request
@@ -77,14 +78,18 @@ def _shape(component: ComponentName, n: int) -> Shape:
 
 
 _DTYPES: dict[str, np.dtype[np.floating]] = {"FP64": np.dtype("<f8"), "FP32": np.dtype("<f4")}
-_OTHER_EXTENSION = f"tensors in the body: the only supported extension is {schema.BINARY}"
+_OTHER_EXTENSION = f"tensors in the body: the supported extensions are {', '.join(schema.EXTENSIONS)}"
 
 
 class InferTask(NamedTuple):
-    """A query and its requested outputs: names in the requested order, each with whether it is encoded in binary."""
+    """A query and its requested outputs: names in the requested order, each with whether it is encoded in binary.
+
+    deflections: those of the play elements, (N, 2 K, n), if the query belongs to a sequence and friction remembers it.
+    """
 
     query: Query
     outputs: dict[str, bool]
+    deflections: Array | None = None
 
     @property
     def is_inline(self) -> bool:
@@ -189,15 +194,16 @@ def _as_read(values: NDArray[np.floating], dtype: np.dtype[np.floating]) -> Arra
         return values.astype(dtype).astype(np.float64)
 
 
-def compute(served: ServedModel, query: Query, names: frozenset[str]) -> dict[str, Array]:
-    """Return the named tensors, with first axis N except MODEL_OUTPUTS. Nothing else is computed.
+def compute(served: ServedModel, task: InferTask) -> dict[str, Array]:
+    """Return the outputs of a task, with first axis N except MODEL_OUTPUTS. Nothing else is computed.
 
     Raise InvalidRequestError if the inertia matrix cannot be inverted.
     """
     model, scale = served.default_model, served.scales.of(None)
+    query, names = task.query, frozenset(task.outputs)
     compared, of_arm = names & EXTERNAL_OUTPUTS.keys(), bool(names & ARM_OUTPUTS.keys())
     needed = {"covariance"} if of_arm else {"tau", "tau_std"} if compared else set()
-    tensors = _torques(model, query.values[:3], names | needed)
+    tensors = _torques(model, query.values[:3], task.deflections, names | needed)
     if names & MODEL_OUTPUTS:
         tensors |= {"noise_std": model.noise_std, "scale": scale}
     if compared:
@@ -206,7 +212,7 @@ def compute(served: ServedModel, query: Query, names: frozenset[str]) -> dict[st
         tensors |= {name: _rows(getattr(seen, EXTERNAL_OUTPUTS[name])) for name in compared}
     parts = {name: COMPONENT_TENSORS[name] for name in names if name in COMPONENT_TENSORS}
     if parts:
-        estimates = query.components(model, sorted({part.component for part in parts.values()}))
+        estimates = query.components(model, sorted({part.component for part in parts.values()}), task.deflections)
         for name, part in parts.items():
             estimate = estimates[part.component]
             tensors[name] = _rows(estimate.std if part.std else estimate.mean)
@@ -218,9 +224,11 @@ def _rows(values: Array) -> Array:
     return values[:, None] if values.ndim == 1 else values
 
 
-def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[str, Array]:
+def _torques(model: TorqueModel, motion: Array, deflections: Array | None, names: frozenset[str]) -> dict[str, Array]:
     """Return the named torque tensors and `_MEAN`; `motion` holds q, dq and ddq, (3, N, n)."""
     wide, rows = "covariance" in names, motion.shape[1]
+    if deflections is not None:
+        motion = np.concatenate([motion, deflections.swapaxes(0, 1)])
     if not wide and names.isdisjoint({"tau_std", FALLBACK}):
         if "tau" not in names:
             return {}
@@ -231,24 +239,31 @@ def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[s
     if rows == 1:
         answer = model.answer_fully(motion[:, 0], covariance=wide)
     else:
-        answer = model.predict(motion[0], motion[1], motion[2], wide)
+        answer = model.predict(motion[0], motion[1], motion[2], wide, deflections)
     share = np.zeros_like(answer.tau) if answer.fallback is None else answer.fallback.share
     tensors = {"tau": answer.tau, "tau_std": answer.tau_std, "covariance": answer.covariance}
     tensors |= {FALLBACK: share, _MEAN: answer.mean}
     return {name: each[None] if rows == 1 else each for name, each in tensors.items() if each is not None}
 
 
-def infer(served: ServedModel, decode: Callable[[], Message], settings: Settings) -> Reply:
+def infer(
+    served: ServedModel, decode: Callable[[], Message], settings: Settings, sequences: Sequences, arrived: float
+) -> Reply:
     """Decode a request and answer it. Blocking: use it in a thread.
 
     Raise what `decode` raises, or InvalidRequestError.
     """
     message = decode()
-    return respond(served, message, read_task(served, message, settings))
+    return respond(served, message, read_task(served, message, settings, sequences, arrived))
 
 
-def read_task(served: ServedModel, message: Message, settings: Settings) -> InferTask:
-    """Check a request against the version of its path and read it; raise InvalidRequestError."""
+def read_task(
+    served: ServedModel, message: Message, settings: Settings, sequences: Sequences, arrived: float
+) -> InferTask:
+    """Check a request against the version of its path, read it and follow its sequence; raise InvalidRequestError.
+
+    arrived: time of the request, of `time.perf_counter`.
+    """
     request = message.request
     for field, value, expected in (
         ("model_name", request.model_name, served.name),
@@ -256,12 +271,15 @@ def read_task(served: ServedModel, message: Message, settings: Settings) -> Infe
     ):
         if value not in (None, expected):
             raise invalid_request(field, value, f"{expected}, as in the path")
-    return read(message, served.model, settings)
+    task, part = read(message, served.model, settings), read_part(request)
+    if part is None or not served.model.remembers:
+        return task
+    return task._replace(deflections=sequences.follow(served, part, arrived, task.query.values[:2]))
 
 
 def respond(served: ServedModel, message: Message, task: InferTask) -> Reply:
     """Compute and encode the answer; raise InvalidRequestError."""
-    values_of = compute(served, task.query, frozenset(task.outputs))
+    values_of = compute(served, task)
     answers: list[Answer] = []
     for name, binary in task.outputs.items():
         values = values_of[name]

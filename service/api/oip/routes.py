@@ -29,7 +29,7 @@ hot = APIRouter(prefix="/v2", tags=_TAGS)
 @needs(READ)
 async def server_metadata() -> schema.ServerMetadata:
     """Return name and version of the server, and the supported extensions of the protocol."""
-    return schema.ServerMetadata(name="lipserve", version=__version__, extensions=[schema.BINARY])
+    return schema.ServerMetadata(name="lipserve", version=__version__, extensions=schema.EXTENSIONS)
 
 
 @router.get("/health/live", summary="Check that the server is alive")
@@ -98,7 +98,7 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
     state, where = scope["app"].state, scope["path_params"]
     decode = partial(wire.decode, body, scope["headers"])
     return await dataplane.infer(
-        state.loaded, state.turns.predictions, where["model"], where.get("version"), len(body), decode
+        state.loaded, state.sequences, state.turns.predictions, where["model"], where.get("version"), len(body), decode
     )
 
 
@@ -107,6 +107,10 @@ async def infer(request: Request) -> Response:
     """Predict torque and other outputs for one query, [n], or a batch, [N, n], in JSON or binary.
 
     Only the outputs in `outputs` are computed; by default `tau` and `tau_std`. Inputs and outputs are not clipped.
+
+    Queries with the same `sequence_id` are one motion, in order of arrival. Friction that depends on earlier motion
+    follows it. The motion before a new `sequence_id`, `sequence_start` or a pause of 0.25 s is unknown.
+
     The 95 % interval of measurements is `tau` ± 1.96 · `scale` · √(`tau_std`² + `noise_std`²), see `PredictResponse`.
 
     External torque needs the measured torque as input `tau`. It is not a safety function. Its outputs are:

@@ -14,7 +14,11 @@ TORQUE = "tau"
 DATATYPES = ("FP64", "FP32")
 HEADER = "Inference-Header-Content-Length"
 BINARY = "binary_tensor_data"
-"""Name of the supported extension in the server's metadata."""
+EXTENSIONS = [BINARY, "sequence", "sequence(string_id)"]
+"""Supported extensions in the server's metadata."""
+SEQUENCE_ID_CHARACTERS = 128
+SEQUENCE_ID = f"a whole number from 1 to {2**64 - 1}, or a string of 1 to {SEQUENCE_ID_CHARACTERS} characters"
+"""The values that `sequence_id` may have."""
 
 Size = Annotated[int, Meta(ge=0)]
 Numbers = list[float | list[float]]
@@ -41,6 +45,12 @@ class RequestParameters(Struct):
     binary_data_output: Annotated[
         bool | None, Meta(description="Return all tensors in binary, unless their own `binary_data` is given")
     ] = None
+    sequence_id: Annotated[
+        int | str | None,
+        Meta(description=f"Sequence of the request, whose queries are one motion: {SEQUENCE_ID}"),
+    ] = None
+    sequence_start: Annotated[bool | None, Meta(description="Forget the earlier queries of the sequence")] = None
+    sequence_end: Annotated[bool | None, Meta(description="Forget the sequence after this request")] = None
 
 
 class InferInput(Struct, forbid_unknown_fields=True):
@@ -117,7 +127,7 @@ class ServerMetadata(BaseModel):
 
     name: str = Field(examples=["lipserve"])
     version: str
-    extensions: list[str] = Field(examples=[[BINARY]])
+    extensions: list[str] = Field(examples=[EXTENSIONS])
 
 
 class ServerLive(BaseModel):

@@ -12,7 +12,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from service.api.oip.schema import HEADER, InferInput, InferRequest, InferResponse, InferTensor, TensorParameters
+from service.api.oip.schema import (
+    HEADER,
+    SEQUENCE_ID,
+    InferInput,
+    InferRequest,
+    InferResponse,
+    InferTensor,
+    TensorParameters,
+)
 from service.api.oip.tensors import Answer, Header
 from service.api.route import OCTETS, Reply
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
@@ -28,6 +36,7 @@ _KINDS = {
     "float | array": "a number, or a list of numbers",
     "float": "a number",
     "str": "a string",
+    "int | str": SEQUENCE_ID,
     "int": "a whole number",
     "int` >= 0": "a whole number of at least 0",
     "bool": "true or false",

@@ -44,12 +44,13 @@ class Message:
     """An inference request. Its answer has raw numbers if the request has, else typed numbers."""
 
     def __init__(self, sent: Any) -> None:
-        """Read an InferRequest; raise InvalidRequestError for a negative shape."""
+        """Read an InferRequest; raise InvalidRequestError for a negative shape or a wrong parameter."""
         self._sent, self._raw = sent, len(sent.raw_input_contents) > 0
         self.request = schema.InferRequest(
             [_input(place, tensor) for place, tensor in enumerate(sent.inputs[:MAX_ITEMS])],
             [schema.InferOutput(each.name, _output_parameters(each.parameters)) for each in sent.outputs[:MAX_ITEMS]]
             or None,
+            parameters=_parameters(sent.parameters),
         )
 
     def check(self) -> None:
@@ -108,6 +109,26 @@ def _input(place: int, tensor: Any) -> schema.InferInput:
     return schema.InferInput(
         tensor.name, shape, tensor.datatype, None, schema.InputParameters(shared_memory_region=region)
     )
+
+
+def _parameters(given: Any) -> schema.RequestParameters | None:
+    """Return the parameters of a request; raise InvalidRequestError."""
+    if not given:
+        return None
+    name = _value(given, "sequence_id")
+    if not (name is None or isinstance(name, str) or type(name) is int):
+        raise invalid_request("parameters.sequence_id", name, schema.SEQUENCE_ID)
+    flags = {each: _value(given, each) for each in ("sequence_start", "sequence_end")}
+    for each, value in flags.items():
+        if not (value is None or isinstance(value, bool)):
+            raise invalid_request(f"parameters.{each}", value, "true or false")
+    return schema.RequestParameters(sequence_id=name, **flags)
+
+
+def _value(given: Any, name: str) -> Any:
+    """Return the value of a parameter, None if it is not given."""
+    kind = given[name].WhichOneof("parameter_choice") if name in given else None
+    return None if kind is None else getattr(given[name], kind)
 
 
 def _output_parameters(given: Any) -> schema.OutputParameters:

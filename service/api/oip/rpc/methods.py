@@ -76,7 +76,7 @@ async def _server_ready(state: State, scope: Scope, body: bytes) -> Reply:
 
 async def _server_metadata(state: State, scope: Scope, body: bytes) -> Reply:
     decode(message("ServerMetadataRequest"), body)
-    return encode(message("ServerMetadataResponse")(name="lipserve", version=__version__, extensions=[schema.BINARY]))
+    return encode(message("ServerMetadataResponse")(name="lipserve", version=__version__, extensions=schema.EXTENSIONS))
 
 
 async def _model_ready(state: State, scope: Scope, body: bytes) -> Reply:
@@ -105,7 +105,7 @@ async def _model_infer(state: State, scope: Scope, body: bytes) -> Reply:
     sent = decode(InferRequest, body)
     name, version = _model(scope, sent, "model_name", "model_version")
     return await dataplane.infer(
-        state.loaded, state.turns.predictions, name, version, len(body), partial(Message, sent)
+        state.loaded, state.sequences, state.turns.predictions, name, version, len(body), partial(Message, sent)
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 HEADER = "Inference-Header-Content-Length"
+EXTENSIONS = ["binary_tensor_data", "sequence", "sequence(string_id)"]
 LETTERS = {"FP64": "d", "FP32": "f"}
 
 
@@ -46,7 +47,7 @@ def changed(motion: dict[str, Any], place: int, **changes: Any) -> dict[str, Any
 
 def wrong_requests(motion: dict[str, Any], joints: str) -> dict[str, tuple[dict[str, Any], str]]:
     """Return requests that every transport rejects, from a correct query, and how the errors begin."""
-    n, supported = len(motion["q"]), "tensors in the body: the only supported extension is binary_tensor_data"
+    n, supported = len(motion["q"]), f"tensors in the body: the supported extensions are {', '.join(EXTENSIONS)}"
     shapes = f"[{n}] for one query or [N, {n}] for a batch: the joints are {joints}"
     region = {"shared_memory_region": "r"}
     shared, needs_tau = f"shared_memory_region is r, expected {supported}", "for forward_dynamics or tau_external"

@@ -20,6 +20,7 @@ from service.api.oip.rpc.messages import MAX_ITEMS
 from tests.service.api.oip.grpc import Code, GrpcService, grpc_request, request, start_service
 from tests.service.api.oip.requests import (
     BATCH,
+    EXTENSIONS,
     MOTION,
     error_message,
     infer_path,
@@ -91,7 +92,7 @@ def test_client_sees_server_and_model(calls, client):
     assert client.is_model_ready("panda-sim")
     assert client.is_model_ready("panda-sim", "1")
     seen = client.get_server_metadata(as_json=True)
-    assert seen == {"name": "lipserve", "version": __version__, "extensions": ["binary_tensor_data"]}
+    assert seen == {"name": "lipserve", "version": __version__, "extensions": EXTENSIONS}
     found = client.get_model_metadata("panda-sim")
     expected = calls.server.client.get("/v2/models/panda-sim").json()
     assert (found.name, list(found.versions), found.platform) == ("panda-sim", ["1"], expected["platform"])

@@ -9,7 +9,7 @@ from numpy.testing import assert_array_equal
 from tritonclient.utils import InferenceServerException
 
 from service import __version__
-from tests.service.api.oip.requests import BATCH, MOTION, json_answer
+from tests.service.api.oip.requests import BATCH, EXTENSIONS, MOTION, json_answer
 from tests.service.data import DEADLINE
 
 pytestmark = pytest.mark.slow  # needs Triton's client
@@ -35,7 +35,7 @@ def test_client_sees_server_and_model(server, client):
     assert client.is_model_ready("panda-sim", "1")
     assert not client.is_model_ready("panda-sim", "2")
     assert not client.is_model_ready("nobody")
-    server_ = {"name": "lipserve", "version": __version__, "extensions": ["binary_tensor_data"]}
+    server_ = {"name": "lipserve", "version": __version__, "extensions": EXTENSIONS}
     assert client.get_server_metadata() == server_
     assert client.get_model_metadata("panda-sim") == server.client.get("/v2/models/panda-sim").json()
 
