@@ -131,8 +131,7 @@ def _choose_joints(
         if fewer.value < trial.value:
             trial, wider = fewer, held_out_errors(fewer.problem, fewer.point, blocks)
     supported = best.value - trial.value >= _min_nats(kind) and not _is_implausible(trial.problem, trial.point)
-    both = (np.exp(np.log(each).mean(axis=1)) for each in (errors, wider))
-    return _Chosen(trial, wider) if supported and _is_better(*both) else None
+    return _Chosen(trial, wider) if supported and _is_better(errors, wider, together=True) else None
 
 
 def _min_nats(kind: DriveKind) -> float:
@@ -140,9 +139,11 @@ def _min_nats(kind: DriveKind) -> float:
     return OPTIONS.min_nats if len(KIND_TERMS[kind]) == 1 else OPTIONS.min_nats_of_several
 
 
-def _is_better(before: Array, after: Array) -> NDArray[np.bool_]:
-    """Return whether held-out errors of B blocks fall beyond their scatter, (…,) of (B, …)."""
-    gains = np.log(before / after)
+def _is_better(before: Array, after: Array, together: bool = False) -> NDArray[np.bool_]:
+    """Return whether held-out errors of B blocks, (B, n), fall beyond their scatter, (n,) or all `together`."""
+    least = np.finfo(float).tiny
+    gains = np.log(np.maximum(before, least)) - np.log(np.maximum(after, least))
+    gains = gains.mean(axis=1) if together else gains
     return np.asarray(gains.mean(axis=0) > OPTIONS.min_deviations * gains.std(axis=0, ddof=1) / np.sqrt(len(gains)))
 
 

@@ -140,13 +140,14 @@ def _torque_parts(
 ) -> dict[str, Estimate]:
     """Return the components of `_TORQUES` and the inertia matrix, from one joint posterior."""
     n, zero = motion.n_joints, np.zeros_like(motion.q)
-    moves = {"rest": Motion(motion.q, zero, zero)}
+    moves = {"rest": replace(motion, dq=zero, ddq=zero)}
     if "coriolis" in names:
-        moves["moving"] = Motion(motion.q, motion.dq, zero)
+        moves["moving"] = replace(motion, ddq=zero)
     if "inertial" in names:
-        moves["accelerating"] = Motion(motion.q, zero, motion.ddq)
+        moves["accelerating"] = replace(motion, dq=zero)
     if "inertia_matrix" in names:
-        moves |= {f"push {joint}": _push(motion.q, joint) for joint in range(n)}
+        pushes = (replace(_push(motion.q, joint), deflections=motion.deflections) for joint in range(n))
+        moves |= {f"push {joint}": push for joint, push in enumerate(pushes)}
     at = {move: index for index, move in enumerate(moves)}
     blocks = [_inertia_rows(at, n) if name == "inertia_matrix" else _vector_rows(name, at, n) for name in names]
     every = combine_torques(posterior, kernel, list(moves.values()), np.concatenate(blocks).reshape(-1, len(moves) * n))

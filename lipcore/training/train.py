@@ -80,7 +80,6 @@ def train(
             None if robot is None else robot.name,
         )
         robot, sibling = base.robot, arm_of_sibling(base)
-    samples = with_deflections(samples, types)
     task = Task(
         samples,
         types,
@@ -91,7 +90,8 @@ def train(
         cancelled=cancelled,
         sibling=sibling,
     )
-    model = fit_model(task, estimator)
+    samples = with_deflections(samples, types)
+    model = fit_model(task.on(samples), estimator)
     model = replace(model, fit={**model.fit, **corrupt.fit_entries()})
     weights = recording_weights(samples.t, samples.episode)
     if not conditioning.should_condition(task.options, len(samples), float(weights.sum())):

@@ -72,11 +72,15 @@ def test_chosen_rows_keep_their_deflections(index: slice | np.ndarray) -> None:
     assert table().rows(index).deflections is None
 
 
-def test_concatenation_keeps_deflections_that_all_parts_have() -> None:
+def test_concatenation_keeps_deflections() -> None:
     parts = [with_elements(table(3), 1), with_elements(table(2), 2)]
     joined = Samples.concatenate(parts).deflections
     assert np.array_equal(joined, np.concatenate([part.deflections for part in parts]))
-    assert Samples.concatenate([parts[0], table(2)]).deflections is None
+    mixed = Samples.concatenate([parts[0], table(2)]).deflections
+    assert mixed is not None
+    assert np.array_equal(mixed[:3], parts[0].deflections)
+    assert (mixed[3:] == np.array([0, 0, 1, 1])[:, None]).all()  # unknown
+    assert Samples.concatenate([table(3), table(2)]).deflections is None
 
 
 @pytest.mark.parametrize("known", [False, True])

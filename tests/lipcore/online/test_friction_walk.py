@@ -59,7 +59,7 @@ def dense_process(base: TorqueModel, rows: Rows, time_s: float, epoch: np.ndarra
     motion = rows.motion()
     features = posterior.basis.features(motion)
     open_ = posterior.basis.uncovered(motion, posterior.basis.features(motion))
-    noise = (posterior.misfit.of_row(posterior.noise_variance, motion.dq) + open_).reshape(-1)
+    noise = (posterior.misfit.of_row(posterior.noise_variance, motion) + open_).reshape(-1)
     prior_mean = posterior.kernel.mean(motion)
     design = np.concatenate([old, features], axis=1)
     when = np.concatenate([np.full(old.shape[1], -10), np.repeat(epoch, rows.q.shape[1])])

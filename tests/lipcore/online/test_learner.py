@@ -134,7 +134,7 @@ def base() -> TorqueModel:
 def row_noise(posterior: CompactPosterior, motion: Motion, shared: float = 10.0) -> np.ndarray:
     """Return the variance of each torque in turn; `shared` rows share lasting errors, in a stream those of a second."""
     misfit, dq = posterior.misfit, motion.dq
-    resting = misfit.rest * np.exp(-((dq / misfit.slow) ** 2))
+    resting = misfit.rest * np.exp(-((dq / misfit.slow) ** 2)) + misfit.still * np.exp(-((dq / 0.02) ** 2))
     noise: np.ndarray = posterior.noise_variance + (shared - 1) * misfit.lasting + shared * resting
     return noise.reshape(-1)
 
