@@ -29,6 +29,7 @@ from lipcore.export.c_weights import (
     move_parameters,
 )
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, PlayState, element_widths
 from lipcore.kernels.drive.terms import SHAPE_SPEEDS, SIGN_WIDTH, STRIBECK_SPEED
 from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
@@ -272,7 +273,7 @@ def _add_payload(model: TorqueModel, learnt: LinearWeights) -> TorqueModel:
     parameters = learnt.arm.arm.parameters.copy()
     parameters[-1] += PAYLOAD.parameters
     loaded = ArmKernel(replace(learnt.arm.arm, parameters=parameters))
-    basis = replace(model.posterior.basis, linear=(loaded, learnt.friction))
+    basis = replace(model.posterior.basis, linear=(loaded, DriveKernel(loaded.arm.friction)))
     return replace(model, posterior=replace(model.posterior, basis=basis))
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -253,8 +254,8 @@ class LinearisedCarrier:
     @cached_property
     def estimator(self) -> Estimator:
         """The model's terms, with the payload in the arm's parameters, plus terms of the payload and of other arms."""
-        estimator, arm = self.carrier.model.estimator, self.carrier.term
-        terms = {name: self._arm if each is arm else each for name, each in estimator.terms.items()}
+        estimator = self.carrier.model.estimator
+        terms = {name: self._loaded(each) for name, each in estimator.terms.items()}
         more = {} if self._others is None else {"others": self._others}
         return replace(estimator, terms={**terms, "payload": self._payload, **more})
 
@@ -263,7 +264,7 @@ class LinearisedCarrier:
         """Basis with the variables w, π / √room, and those of other arms."""
         basis = self.carrier.model.posterior.basis
         own = np.diag(np.sqrt(self._payload.variances(basis.params)))
-        linear = [self._arm if each is self.carrier.term else each for each in basis.linear]
+        linear = [self._loaded(each) for each in basis.linear]
         linear, roots = [*linear, self._payload], [basis.root, own]
         if self._others is not None:
             linear.append(self._others)
@@ -281,8 +282,26 @@ class LinearisedCarrier:
         out = np.empty((len(features) + PARAMETERS, *base.shape))
         out[: places.start], out[places.stop : -PARAMETERS] = features[: places.start], features[places.stop :]
         out[places] = of_arm.transpose(2, 0, 1) * self.carrier.root[places][:, None, None]
+        if self._friction is not None:  # friction grows with the payload, too
+            rubbing, kernel = self._friction
+            where = self.carrier.model.posterior.basis.rows(rubbing)
+            out[where] = kernel.features(motion).transpose(2, 0, 1) * self.carrier.root[where][:, None, None]
         out[-PARAMETERS:] = self._payload.features(motion).transpose(2, 0, 1)
         return out, base if centre is None else base + of_arm @ centre
+
+    def _loaded(self, term: Any) -> Any:
+        """Return a term of the model with the payload."""
+        if term is self.carrier.term:
+            return self._arm
+        return self._friction[1] if self._friction is not None and term is self._friction[0] else term
+
+    @cached_property
+    def _friction(self) -> tuple[DriveKernel, DriveKernel] | None:
+        """The drive without and with the payload in its load; None if friction does not grow with the load."""
+        friction = self.carrier.model.estimator.terms["friction"]
+        if not isinstance(friction, DriveKernel) or "load" not in friction.drive.kinds:
+            return None
+        return friction, DriveKernel(self._arm.arm.friction)
 
     @cached_property
     def _arm(self) -> ArmKernel:
