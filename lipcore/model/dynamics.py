@@ -15,6 +15,7 @@ from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.play import deflections_of
 from lipcore.model.functionals import (
     EnergyKernel,
     Estimate,
@@ -78,7 +79,8 @@ def components(
     estimates: dict[str, Estimate] = {}
     torques = [name for name in asked if name in _TORQUES or name == "inertia_matrix"]
     if torques:
-        estimates |= _torque_parts(posterior, SumKernel(*terms), motion, torques)
+        fixed = _with_fixed_deflections(model.estimator, motion)
+        estimates |= _torque_parts(posterior, SumKernel(*terms), fixed, torques)
     if "friction" in asked:
         friction = model.estimator.terms["friction"]
         estimates["friction"] = combine_torques(posterior, friction, [motion], np.eye(model.n_joints))
@@ -107,14 +109,15 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
     Raise IndefiniteInertiaError if M is not positive definite.
     """
     posterior = model.posterior
-    inertia = inertia_matrix(posterior, SumKernel(*_dynamics_terms(model.estimator)), motion.q)
+    friction, fixed = model.estimator.terms.get("friction"), _with_fixed_deflections(model.estimator, motion)
+    inertia = inertia_matrix(posterior, SumKernel(*_dynamics_terms(model.estimator)), fixed)
     inertia = 0.5 * (inertia + inertia.mT)
     lowest = np.linalg.eigvalsh(inertia)[:, 0]
     if not (lowest > 0).all():
         raise IndefiniteInertiaError(int(np.argmin(lowest > 0)))
-    friction, ddq = model.estimator.terms.get("friction"), np.zeros_like(motion.q)
+    ddq = np.zeros_like(motion.q)
     for _ in range(LOAD_STEPS if isinstance(friction, DriveKernel) and "load" in friction.drive.kinds else 1):
-        left = tau - posterior.mean(replace(motion, ddq=ddq))
+        left = tau - posterior.mean(replace(fixed, ddq=ddq))
         ddq = ddq + np.linalg.solve(inertia, left[:, :, None])[:, :, 0]
     covariance = posterior.predict(replace(motion, ddq=ddq)).covariance
     half = np.linalg.solve(inertia, covariance)  # M⁻¹ Σ
@@ -122,16 +125,16 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
     return Estimate(ddq, np.sqrt(variance.clip(0.0)))
 
 
-def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Array) -> Array:
+def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, motion: Motion) -> Array:
     """Return the posterior mean of M(q), (N, n, n), kg·m² if both joints are revolute.
 
-    dynamics: the kernel's terms without friction; q: (N, n) rad or m. Column j is the torque per unit acceleration of
-    joint j, f(q, 0, e_j) − f(q, 0, 0). This is exact, since torque is affine in ddq.
+    dynamics: the kernel's terms without friction; motion: N instants, of which q and fixed deflections are read. Column
+    j is the torque per unit acceleration of joint j, f(q, 0, e_j) − f(q, 0, 0). This is exact, since torque is affine
+    in ddq.
     """
-    n = q.shape[1]
-    zero = np.zeros_like(q)
-    rest = posterior.mean(Motion(q, zero, zero), dynamics)
-    pushes = [_push(q, joint) for joint in range(n)]
+    zero = np.zeros_like(motion.q)
+    rest = posterior.mean(replace(motion, dq=zero, ddq=zero), dynamics)
+    pushes = [_push(motion, joint) for joint in range(motion.n_joints)]
     return np.stack([posterior.mean(push, dynamics) - rest for push in pushes], axis=2)
 
 
@@ -146,8 +149,7 @@ def _torque_parts(
     if "inertial" in names:
         moves["accelerating"] = replace(motion, dq=zero)
     if "inertia_matrix" in names:
-        pushes = (replace(_push(motion.q, joint), deflections=motion.deflections) for joint in range(n))
-        moves |= {f"push {joint}": push for joint, push in enumerate(pushes)}
+        moves |= {f"push {joint}": _push(motion, joint) for joint in range(n)}
     at = {move: index for index, move in enumerate(moves)}
     blocks = [_inertia_rows(at, n) if name == "inertia_matrix" else _vector_rows(name, at, n) for name in names]
     every = combine_torques(posterior, kernel, list(moves.values()), np.concatenate(blocks).reshape(-1, len(moves) * n))
@@ -190,12 +192,22 @@ def _symmetric(upper: Array, n: int) -> Array:
     return full
 
 
-def _push(q: Array, joint: int) -> Motion:
+def _push(motion: Motion, joint: int) -> Motion:
     """Return the unit acceleration of one joint from standstill."""
-    zero = np.zeros_like(q)
+    zero = np.zeros_like(motion.q)
     push = zero.copy()
     push[:, joint] = 1.0
-    return Motion(q, zero, push)
+    return replace(motion, dq=zero, ddq=push)
+
+
+def _with_fixed_deflections(estimator: Estimator, motion: Motion) -> Motion:
+    """Return the motion with deflections that do not depend on ddq. Alternative arms differ in friction."""
+    friction = estimator.terms.get("friction")
+    if not isinstance(friction, DriveKernel) or (elements := friction.drive.elements) is None:
+        return motion
+    known = deflections_of(replace(motion, ddq=np.zeros_like(motion.q)), elements.widths, elements.acceleration)
+    known[:, len(elements.widths) :] = 0.0
+    return replace(motion, deflections=known)
 
 
 def _dynamics_terms(estimator: Estimator) -> list[TorqueKernel]:

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.drive.play import MAX_GAP_S, with_deflections
+from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, with_deflections
 from lipcore.model import dynamics
 from service.contract.predictions import PredictRequest
 from service.inference import predicting
@@ -90,7 +90,7 @@ def test_queries_alone_are_more_uncertain_at_low_speed(api, model, samples):
 
 
 def test_components_follow_the_motion(api, model, samples):
-    samples = samples.rows(slice(60))
+    samples = samples.rows(slice(100))
     names, motion = list(dynamics.COMPONENTS), rows_of(samples, slice(None))
     deflections = deflections_of(samples)
     tau = model.predict(**motion, deflections=deflections).tau
@@ -101,7 +101,9 @@ def test_components_follow_the_motion(api, model, samples):
         assert_allclose(answer[name]["mean"], estimate.mean, rtol=1e-6, atol=1e-9 * size)
         assert_allclose(answer[name]["std"], estimate.std, rtol=1e-4, atol=1e-6 * size)
     parts = sum(np.array(answer[name]["mean"]) for name in ("inertial", "coriolis", "gravity", "friction"))
-    assert_allclose(parts, tau, rtol=1e-6, atol=1e-9)
+    certain = (deflections[:, len(ELEMENTS) :] == 0).all(axis=(1, 2))  # else parts differ in what is known
+    assert certain.sum() > 10
+    assert_allclose(parts[certain], tau[certain], rtol=1e-6, atol=1e-9)
     alone = predict_json(api, MODEL, **motion, components=["friction"])["components"]["friction"]
     assert np.abs(np.subtract(answer["friction"]["mean"], alone["mean"])).max() > 0.1
 

@@ -28,8 +28,9 @@ def test_damaged_data_set_is_not_evaluated_or_trained_on(api, trained, spoil):
     spoil(service.files.datasets / f"{dataset['id']}.safetensors")
     answer = api.post(f"/v1/models/{trained.name}/evaluate", json={"dataset": dataset["id"]})
     assert dataset["id"] in error(answer, 500, "damaged_data")["message"]
+    request = {"datasets": [dataset["id"]], "joint_types": ["revolute"] * 2}
     with pytest.raises(DamagedDataError, match="Upload it again"):
-        load_datasets(service.database, service.files, {"datasets": [dataset["id"]]})
+        load_datasets(service.database, service.files, request)
     assert api.get(f"/v1/datasets/{dataset['id']}").status_code == 200
     assert api.delete(f"/v1/datasets/{dataset['id']}").status_code == 204
 
