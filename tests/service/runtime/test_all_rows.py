@@ -9,6 +9,7 @@ import pytest
 import lipcore
 from lipcore.data import independence
 from lipcore.data.samples import Samples
+from lipcore.kernels.drive.play import with_deflections
 from lipcore.training.conditioning import SHARD, condition
 from service.foundation.settings import Settings
 from service.runtime.executors import Inline, shard_executor, sum_shards
@@ -92,11 +93,14 @@ def test_weights_in_shards_equal_weights_of_the_whole(settings, parts):
     for part in (masked(parts[0]), parts[0]):
         shards = list(part.shards())
         assert {each.last - each.first for each in shards} == {SHARD, ROWS - SHARD}
-        read_back = [read(settings, tuple(part.row.joint_names), each) for each in shards]
+        types = ("revolute",) * len(part.row.joint_names)
+        read_back = [read(settings, tuple(part.row.joint_names), types, each) for each in shards]
         samples, mask = recording(), slice(None) if part.chosen is None else part.chosen
         weights = np.concatenate([weights for _, weights in read_back])
         np.testing.assert_array_equal(weights, independence.recording_weights(samples.t, samples.episode)[mask])
         np.testing.assert_array_equal(np.concatenate([each.tau for each, _ in read_back]), samples.tau[mask])
+        whole = with_deflections(samples, types).rows(mask).deflections
+        np.testing.assert_array_equal(np.concatenate([each.deflections for each, _ in read_back]), whole)
         assert part.independent_rows() == pytest.approx(weights.sum())
 
 
