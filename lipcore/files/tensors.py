@@ -13,15 +13,16 @@ from lipcore.files.arm import is_arm_tensor
 from lipcore.files.manifest import TENSORS, Limits, ModelFormatError
 from lipcore.files.strict_json import quote
 from lipcore.kernels.drive.play import ELEMENTS
+from lipcore.kernels.fast.answer import MISFIT_ROWS
 from lipcore.model.selection import Count
-from lipcore.posterior.misfit import Misfit
+from lipcore.posterior.misfit import EARLIER_ROWS, Misfit
 
 MAX_HEADER_BYTES = 256 * 1024
 HEADER_LENGTH_BYTES = 8
 """Size of the header's length field."""
 OUTPUTS = "inducing/outputs"
 INDUCING = ("inducing/q", "inducing/dq", "inducing/ddq")
-MISFIT_ROWS = 5, 6, 6 + 2 * len(ELEMENTS)
+_MISFIT_ROWS = EARLIER_ROWS, MISFIT_ROWS, MISFIT_ROWS + 2 * len(ELEMENTS)
 """Rows of a misfit: of earlier releases, without and with play elements."""
 A, B, FLOOR, MISFIT = "statistics/a", "statistics/b", "floor", "misfit"
 PARAMS = "params/"
@@ -151,6 +152,6 @@ def _check_sizes(entries: dict[str, Tensor], n: int, limits: Limits) -> None:
     if entries[A].shape != (b[0] * (b[0] + 1) // 2,):
         length = b[0] * (b[0] + 1) // 2
         raise _bad(f"{A} has shape {entries[A].shape}, expected M (M + 1) / 2 numbers, {length}, as {B} has {b[0]}")
-    for name, shapes in ((FLOOR, [(n,)]), (MISFIT, [(rows, n) for rows in MISFIT_ROWS])):
+    for name, shapes in ((FLOOR, [(n,)]), (MISFIT, [(rows, n) for rows in _MISFIT_ROWS])):
         if name in entries and entries[name].shape not in shapes:
             raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shapes[-1]}")

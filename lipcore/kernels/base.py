@@ -42,6 +42,12 @@ class Regressor(ABC):
         The numbers are those of `fill`, to the last bit.
         """
 
+    def features(self, motions: Array) -> Array:
+        """Return Φ of N queries, (N, n, p). motions: as of `Motion.arrays`."""
+        rows = np.empty((len(motions), self.size, self.n_joints))
+        self.fill_many(motions, rows, 0)
+        return np.ascontiguousarray(rows.transpose(0, 2, 1))
+
 
 class Cross(ABC):
     """Covariances of single queries with S inducing samples, for a kernel with fixed hyperparameters.
@@ -227,10 +233,7 @@ class LinearKernel(TorqueKernel):
 
     def features(self, x: Motion) -> Array:
         """Return Φ at each sample, (N, n, p)."""
-        regressor = self.regressor()
-        rows = np.empty((len(x), regressor.size, self.n_joints))
-        regressor.fill_many(x.arrays(), rows, 0)
-        return np.ascontiguousarray(rows.transpose(0, 2, 1))
+        return self.regressor().features(x.arrays())
 
     @abstractmethod
     def variances(self, params: Params) -> Array:

@@ -6,8 +6,7 @@ from collections.abc import Collection
 from math import isfinite
 
 from lipcore.data import metrics
-from lipcore.data.metrics import Comparison, Difference, TorqueDistribution, evaluate
-from lipcore.data.samples import Samples
+from lipcore.data.metrics import Comparison, Difference, evaluate
 from service.contract import predictions as schema
 from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
@@ -25,7 +24,7 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
     """
     first, second = versions = _versions(loaded, model, request)
     recorded = read_dataset(loaded, request.dataset, *versions)
-    answers = [_answer(each, recorded.used) for each in versions]
+    answers = [each.model.predict_along(recorded.used).interval for each in versions]
     compared = metrics.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
     in_training = [each.has_learnt_from(recorded.id, recorded.sha256) for each in versions]
@@ -70,10 +69,6 @@ def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) 
             "versions[1]", request.versions[1], f"another version than that of versions[0], {first.version}"
         )
     return first, second
-
-
-def _answer(served: ServedModel, samples: Samples) -> TorqueDistribution:
-    return served.model.predict_along(samples).interval
 
 
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:

@@ -44,7 +44,8 @@ class Context:
     model: dict[str, bytes]
     """Packed files of the model."""
     joint_names: tuple[str, ...]
-    joint_types: tuple[JointType, ...]
+    joint_types: tuple[JointType, ...] | None
+    """Types of the joints, if friction remembers motion, else None."""
     device: Device
     """Device to compute on."""
 
@@ -70,7 +71,11 @@ def all_rows(
     if shards:
         progress(0.0)
         context = Context(
-            settings_to_send(settings), packed(model), model.joint_names, model.joint_types, "cuda" if gpu else "cpu"
+            settings_to_send(settings),
+            packed(model),
+            model.joint_names,
+            model.joint_types if model.remembers else None,
+            "cuda" if gpu else "cpu",
         )
         with shard_executor(settings, gpu) as executor:
             work = partial(shard_statistics, context)
@@ -92,7 +97,7 @@ def shard_statistics(context: Context, shard: Shard) -> ShardStatistics:
 
 
 def read(
-    settings: Settings, joint_names: tuple[str, ...], joint_types: tuple[JointType, ...], shard: Shard
+    settings: Settings, joint_names: tuple[str, ...], joint_types: tuple[JointType, ...] | None, shard: Shard
 ) -> tuple[Samples, Array]:
     """Return the selected rows of a shard and their weights, (N,)."""
 
@@ -109,7 +114,8 @@ def read(
         weights *= independence.recording_weights(values["t"], values["episode"])[rows]
     values = {name: each[rows] for name, each in values.items()}
     values |= {name: reader.array(name, shard.first, shard.last) for name in ("q", "dq", "ddq", "tau")}
-    deflections = follow(reader, np.arange(shard.first, shard.last), joint_types)
+    index = np.arange(shard.first, shard.last)
+    deflections = None if joint_types is None else follow(reader, index, joint_types)
     samples = Samples(joint_names=joint_names, deflections=deflections, **values)
     return (samples, weights) if mask is None else (samples.rows(mask), weights[mask])
 

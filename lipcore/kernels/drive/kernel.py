@@ -71,9 +71,7 @@ class Drive:
 
     def features(self, motions: Array) -> Array:
         """Return the features P of N motions, joint by joint, (N, n, f n) (section 5 of docs/method.md)."""
-        rows = np.empty((len(motions), self.regressor.size, self.n_joints))
-        self.regressor.fill_many(motions, rows, 0)
-        return np.ascontiguousarray(rows.transpose(0, 2, 1))
+        return self.regressor.features(motions)
 
 
 class DriveKernel(LinearKernel):

@@ -9,8 +9,8 @@ After a stroke of 2 r in one direction e is ±1, wherever it was before. Until t
 follow the same rule and begin at −1 and 1. The expected deflection is their middle. Its standard deviation is half of
 their distance: a joint that has stopped may have slipped in either direction.
 
-If one instant alone is known, or is more certain, its velocity v and acceleration a tell where the joint comes from.
-With the usual acceleration u and A² = a² + (0.1 u)²,
+The velocity v and acceleration a of one instant also tell where the joint comes from. This is used if the motion before
+is unknown, or less certain. With the usual acceleration u and A² = a² + (0.1 u)²,
 
     e = clip(s − a / A, −1, 1),    s = v |v| / (2 A r)
 

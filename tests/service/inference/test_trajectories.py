@@ -101,7 +101,7 @@ def test_components_follow_the_motion(api, model, samples):
         assert_allclose(answer[name]["mean"], estimate.mean, rtol=1e-6, atol=1e-9 * size)
         assert_allclose(answer[name]["std"], estimate.std, rtol=1e-4, atol=1e-6 * size)
     parts = sum(np.array(answer[name]["mean"]) for name in ("inertial", "coriolis", "gravity", "friction"))
-    certain = (deflections[:, len(ELEMENTS) :] == 0).all(axis=(1, 2))  # else parts differ in what is known
+    certain = (deflections[:, len(ELEMENTS) :] == 0).all(axis=(1, 2))  # the sum is exact for these rows
     assert certain.sum() > 10
     assert_allclose(parts[certain], tau[certain], rtol=1e-6, atol=1e-9)
     alone = predict_json(api, MODEL, **motion, components=["friction"])["components"]["friction"]
