@@ -57,6 +57,9 @@ class PayloadPosterior:
     others: tuple[Alternative, ...] = ()
     """Arms with their payloads that are equally probable, this one first; empty if the posterior is practically
     linear."""
+    excess: Array | float = 0.0
+    """Variance of the errors of rows with the payload, beyond the stated one, (n,) (N·m)². It lasts like an error of
+    the arm."""
 
     @property
     def payload(self) -> Array:

@@ -48,6 +48,15 @@ def correlation_roots(carrier: Carrier, rows: Rows) -> Array:
     return np.asarray(np.linalg.cholesky(covariance))
 
 
+def excess_variance(roots: Array, whitened: Array, count: int) -> Array:
+    """Return by how much the last `count` rows exceed the variance of their errors, (n,) (N·m)².
+
+    whitened: (N n,) residuals, joint by joint.
+    """
+    residual = (roots @ whitened.reshape(len(roots), -1, 1))[..., 0]
+    return np.asarray((residual**2 - (roots**2).sum(axis=-1))[:, -count:].mean(axis=1).clip(0.0))
+
+
 def whiten(roots: Array, features: Array, residual: Array) -> tuple[Array, Array]:
     """Return features (M + 10, N n) and residuals (N n,) with independent errors of variance one."""
     both = np.concatenate([features, residual[None]]).transpose(2, 1, 0)

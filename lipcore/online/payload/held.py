@@ -143,17 +143,17 @@ class TrackedPayload:
             since, values["declared"], rows, nothing, every, count, OPTIONS.growth * count, ANY_PAYLOAD, seen
         )
 
-    def add_rows(self, carrier: Carrier, rows: Rows) -> TrackedPayload:
-        """Return the payload after more rows."""
+    def add_rows(self, carrier: Carrier, rows: Rows, at_once: bool = False) -> TrackedPayload:
+        """Return the payload after more rows. at_once: whether it is estimated again, though it is not due."""
         first = -self.count % self.every
         kept = Rows.concatenate([self.rows, rows.take(slice(first, None, self.every))])
         every, count = self.every, self.count + len(rows)
         if len(kept) > OPTIONS.max_rows:
             kept, every = kept.take(slice(0, None, 2)), 2 * every
         held = replace(self, rows=kept, every=every, count=count)
-        if count < self.due or (
-            self.estimate.draws and carrier.is_tip_unidentified
-        ):  # only refining follows its valleys
+        # if the tip is unidentified, only refining follows its valleys
+        due = count >= self.due and not (self.estimate.draws and carrier.is_tip_unidentified)
+        if not (due or at_once):
             return held
         moved = replace(estimate(carrier, kept, self.before, self.prior, self.estimate), draws=self.estimate.draws)
         if self.declared and np.abs((moved.eta - self.prior.centre) / DECLARED_STD).max() > OPTIONS.max_stds:

@@ -237,13 +237,27 @@ class PayloadTracker:
                 return self._pick_up(carrier, changed)
         if max(best.values()) <= VERDICT.sure_nats:
             return replace(self, off=0)._estimate_from(carrier, parts)
+        state = classify_state(gains)
+        # friction seldom changes, and the payload's estimate is often inexact
+        if state != "contact" and (corrected := self._correct(carrier, parts)) is not None:
+            return corrected
         off = self.off + len(parts)
         if off >= OPTIONS.max_off:  # no contact lasts so long: the estimate is wrong, or the payload another one
             again = self._pick_up(carrier, len(self.recent))
             if again.held is not self.held:
                 return again
-        state = classify_state(gains)
         return replace(self, off=off)._with_state("payload" if state == "none" else state)
+
+    def _correct(self, carrier: Carrier, parts: Sequence[Rows]) -> PayloadTracker | None:
+        """Return the tracker with the payload estimated at once from more rows; None if it does not explain them."""
+        assert self.held is not None
+        held = self.held.add_rows(carrier, Rows.concatenate(parts), at_once=True)
+        watch = replace(self, held=held, off=0)._relinearise(carrier)
+        assert watch.around is not None
+        gains = CellWindow.of(watch.around, watch.cells[-WINDOW.cells :]).gains()
+        if max(max(each.values()) for each in gains.values()) > VERDICT.sure_nats:
+            return None
+        return replace(watch, probabilities=probabilities(gains))._with_state("payload")
 
     def _gain_unloaded(self, carrier: Carrier, window: CellWindow, gains: Gains) -> tuple[float, int]:
         """Return the nats by which the arm without payload explains the last cells better, and their number."""

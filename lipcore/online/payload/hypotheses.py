@@ -135,7 +135,7 @@ def _means(
             dq[k],
             left[k],
             white / len(part),
-            lasting[k],
+            lasting[k] + around.load.excess,
             rest[k],
             features[:, k],
         )

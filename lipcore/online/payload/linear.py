@@ -18,7 +18,7 @@ from lipcore.data.samples import Array
 from lipcore.model.payload import Carrier, LinearisedCarrier, PayloadPosterior
 from lipcore.online.batch import Rows
 from lipcore.online.payload.bodies import PayloadPrior, body, inverse, most_likely
-from lipcore.online.payload.errors import correlation_roots, whiten
+from lipcore.online.payload.errors import correlation_roots, excess_variance, whiten
 from lipcore.online.payload.estimate import Estimate, explain_unloaded
 from lipcore.robots.urdf import PARAMETERS
 
@@ -62,7 +62,9 @@ def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: PayloadPrio
         room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
         w = mean + open_ @ score[:size] + back @ payload
         left = residual - features.T @ np.concatenate([w - mean, payload])
-        load = PayloadPosterior(np.concatenate([w, payload]), joint, room)
+        load = PayloadPosterior(
+            np.concatenate([w, payload]), joint, room, excess=excess_variance(roots, left, len(rows))
+        )
         if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < 0.05:
             break
     contact = explain_unloaded(carrier, free, loaded, both.tau, roots)[2]

@@ -37,7 +37,7 @@ from lipcore.online.payload.draws import (
     linearised_around,
     minimum,
 )
-from lipcore.online.payload.errors import correlation_roots, whiten
+from lipcore.online.payload.errors import correlation_roots, excess_variance, whiten
 from lipcore.online.payload.estimate import Estimate, Instants, explain_unloaded, rows_of
 from lipcore.online.payload.linear import linear
 from lipcore.robots.urdf import PARAMETERS
@@ -256,8 +256,9 @@ class _Problem:
         room = PARAMETERS * np.diagonal(slope @ inverse(self.prior.precision) @ slope.T)
         others, bent = _find_alternatives(carrier, at, root, found)
         draws = tuple(Draw(each.point.place, each.noise) for each in found) if bent else ()
+        excess = excess_variance(self.roots, at.residual[-self.tau.size :], len(self.loaded[0]))
         load = PayloadPosterior(
-            np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others
+            np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others, excess
         )
         of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
         if others:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lipcore import load
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.learner import OnlineModel
@@ -86,6 +87,20 @@ def test_push_on_one_joint_is_a_contact(carrier):
     trackers = track_payload(carrier, replace(rows, tau=rows.tau + push))
     assert all(tracker.held is None for _, tracker in trackers)
     assert "contact" in {tracker.state for _, tracker in trackers}
+
+
+def test_friction_that_grows_with_the_payload_has_not_changed(carrier):
+    """The arm's friction is a tenth of the payload's torque larger, which its training does not know."""
+    motion = Simulation(2000, RATE, speed=5.0, noise=0.05)
+    payloads = None, Payload(1.5, 0.0, (0.02, 0.02, 0.08))
+    free, full = (simulate(load_robot("panda"), replace(motion, payload=payload), 301) for payload in payloads)
+    weight = full.tau - free.tau
+    rubbing = 0.1 * np.abs(weight) * np.tanh(free.dq / SIGN_WIDTH)
+    tau = free.tau + (free.t >= 14.0)[:, None] * (weight + rubbing)
+    trackers = track_payload(carrier, between(as_rows(replace(free, tau=tau), 0.0), 13.0))
+    assert {tracker.state for at, tracker in trackers if at > 15.0} == {"payload"}
+    mass, std = trackers[-1][1].held.estimate.mass
+    assert abs(mass - 1.5) < 1.96 * std
 
 
 @pytest.mark.slow
