@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from functools import partial
 from itertools import count
 
@@ -20,6 +21,7 @@ from tests.service.learning.learning_models import QUERIES, LearningModel, obser
 from tests.service.learning.test_changes import EXTERNAL_TORQUE_NM, STRICT_OPTIONS, monitor_state, send_recording
 from tests.service.learning.test_intervals import biased_batch
 from tests.service.server import Server
+from tests.system import remembering
 from tests.system.cluster.pairs import (
     LEARN_EVERYTHING,
     Pair,
@@ -268,9 +270,9 @@ def start_service(shared: Shared, name: str) -> Server:
     return Server(shared.home(name), **(shared.env() | {"LIPSERVE_FILES_URL": shared.folder_url}))
 
 
-def pupil(server: Server) -> LearningModel:
+def pupil(server: Server, model: str = MODEL) -> LearningModel:
     """Return the model as a service shows it."""
-    return LearningModel(server.client, MODEL)
+    return LearningModel(server.client, model)
 
 
 def send_until_acknowledged(servers: list[Server], number: int, rng: np.random.Generator) -> int:
@@ -312,3 +314,31 @@ def test_killed_service_loses_no_acknowledged_batch(shared, servers, seed):
     with start_service(shared, victim.home.name) as again:
         one, two = predict_at_revision([pupil(again), pupil(other)], BATCHES)
         assert one == two
+
+
+def test_services_follow_the_motion_of_a_stream_whichever_is_killed(shared):
+    """Its batches reach the services in turn, each of them is killed once, and a batch is unlearnt meanwhile."""
+    publish_models(shared, remembering.save_model(shared.folder / "remembering"), remembering.MODEL)
+    names = ["one", "two"]
+    with ExitStack() as running:
+        servers = [running.enter_context(start_service(shared, name)) for name in names]
+        pupil(servers[0], remembering.MODEL).put("learning", LEARN_EVERYTHING)
+        for number in range(remembering.BATCHES):
+            at = number % 2
+            pupil(servers[at], remembering.MODEL).post("observations", remembering.stream_batch(number))
+            if number == 6:
+                unlearnt = f"observations/{remembering.STREAM}/{remembering.UNLEARNT}"
+                pupil(servers[1], remembering.MODEL).delete(unlearnt)
+            if number in (4, 7):
+                servers[at].kill()
+                servers[at] = running.enter_context(start_service(shared, names[at]))
+        pupils = [pupil(server, remembering.MODEL) for server in servers]
+        predict_at_revision(pupils, remembering.BATCHES + 1)
+        one, two = (each.predict(remembering.query_along()) for each in pupils)
+    assert one == two
+    database = Database.of(shared.settings("looking"))
+    logged = remembering.read_stream(database)
+    database.close()
+    remembering.assert_deflections_known(logged)
+    expected = remembering.predict_learnt(logged, remembering.UNLEARNT)
+    np.testing.assert_allclose(one["tau"], expected, atol=remembering.TOLERANCE_NM)
