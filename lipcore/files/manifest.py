@@ -77,6 +77,7 @@ class Fit(TypedDict, total=False):
     samples_hyperparameters: Count
     samples_posterior: Count
     samples_corrupt: Count
+    samples_braked: Count
     corrupt: Annotated[
         str,
         Meta(max_length=300, pattern=r"^\d+ by [a-z]+(, \d+ by [a-z]+)*; the first are rows [\d, ]+, counted from 0$"),

@@ -170,12 +170,13 @@ def plan(
     given: tuple[str, ...],
     recipe: Recipe,
     corrupt: NDArray[np.bool_] | None = None,
+    braked: NDArray[np.bool_] | None = None,
 ) -> Plan:
     """Return the plan of the recipe for a recording of N rows.
 
     t: (N,) s, rising within an episode, None if not recorded; episode: (N,) numbers, None if there is only one;
-    missing: (N,) mask of rows with an unknown time or value; given: recorded ones of q, dq, ddq, tau; corrupt: (N,)
-    mask of other rows to leave out before a filter spreads them (`lipcore.data.outliers`).
+    missing: (N,) mask of rows with an unknown time or value; given: recorded ones of q, dq, ddq, tau; corrupt, braked:
+    (N,) masks of other rows to leave out before a filter spreads them (`lipcore.data.outliers`, `brakes`).
 
     Raise PreparationError if the recording does not allow the recipe.
     """
@@ -183,7 +184,8 @@ def plan(
     to_derive = list_derived(given)
     steps: list[record.Step] = []
     damaged = np.zeros_like(missing) if corrupt is None else corrupt & ~missing
-    rows = _rows(t, episode, missing, damaged, steps)
+    held = np.zeros_like(missing) if braked is None else braked & ~missing & ~damaged
+    rows = _rows(t, episode, missing, {"corrupt": damaged, "braked": held}, steps)
     if t is None:
         _check_times_are_not_needed(given, to_derive, recipe)
         changes = np.diff(rows.episode) != 0
@@ -210,18 +212,20 @@ def _rows(
     t: Array | None,
     episode: Array | None,
     missing: NDArray[np.bool_],
-    corrupt: NDArray[np.bool_],
+    unusable: Mapping[str, NDArray[np.bool_]],
     steps: list[record.Step],
 ) -> _Rows:
-    """Return the rows that are neither missing nor corrupt, without repeated times."""
+    """Return the rows that are neither missing nor unusable, by reason, without repeated times."""
     numbers = np.zeros(len(missing)) if episode is None else episode
     count = int(missing.sum())
     first = int(missing.argmax()) + 1 if count else None
     if first is not None:
         steps.append(record.describe_rows_left_out("missing", count, first))
-    if corrupt.any():
-        steps.append(record.describe_rows_left_out("corrupt", int(corrupt.sum()), int(corrupt.argmax()) + 1))
-    kept = ~(missing | corrupt)
+    kept = ~missing
+    for why, mask in unusable.items():
+        kept &= ~mask
+        if mask.any():
+            steps.append(record.describe_rows_left_out(why, int(mask.sum()), int(mask.argmax()) + 1))
     repeated = 0
     if t is not None:
         places = np.flatnonzero(kept)

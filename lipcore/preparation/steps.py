@@ -10,10 +10,11 @@ Step = dict[str, Any]
 
 
 def describe_rows_left_out(why: str, rows: int, first: int) -> Step:
-    """Return the step of rows left out, the first of them counted from 1. why: "missing", "corrupt" or "repeated"."""
+    """Return the step of rows left out, the first of them counted from 1. why: as below."""
     reason = {
         "missing": "with missing values",
         "corrupt": "inconsistent with neighbouring rows",
+        "braked": "with closed brakes",
         "repeated": "with a repeated time stamp",
     }[why]
     text = f"{_count(rows, 'row')} {reason} left out, the first is row {first}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lipcore.data import outliers
+from lipcore.data import brakes, outliers
 from lipcore.data.independence import recording_weights
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Samples
@@ -38,7 +38,8 @@ def train(
 ) -> TorqueModel:
     """Train a model on samples of n joints.
 
-    Corrupt rows are removed first, and the fit's report contains their number (`lipcore.data.outliers`).
+    Corrupt rows (`lipcore.data.outliers`) and rows with closed brakes (`lipcore.data.brakes`) are removed first. The
+    fit's report contains their numbers.
 
     Args:
         samples: Samples of n joints.
@@ -63,7 +64,9 @@ def train(
 
     """
     corrupt = outliers.find_in_samples(samples)
-    samples = samples.rows(~corrupt.rows) if corrupt.count else samples
+    braked = brakes.find_in_samples(samples)
+    removed = corrupt.rows | braked.rows
+    samples = samples.rows(~removed) if removed.any() else samples
     types, options = check_joint_types(joint_types), options or FitOptions()
     sibling = None
     if base is not None:
@@ -92,7 +95,8 @@ def train(
     )
     samples = with_deflections(samples, types)
     model = fit_model(task.on(samples), estimator)
-    model = replace(model, fit={**model.fit, **corrupt.fit_entries()})
+    counts = {"samples_braked": int(braked.rows.sum())} if braked.joints else {}
+    model = replace(model, fit={**model.fit, **corrupt.fit_entries(), **counts})
     weights = recording_weights(samples.t, samples.episode)
     if not conditioning.should_condition(task.options, len(samples), float(weights.sum())):
         return model

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.brakes import BrakedRows, find_braked_rows
 from lipcore.data.outliers import CorruptRowsError, find_corrupt_rows
 from lipcore.data.samples import Array
 from lipcore.preparation.plan import plan
@@ -147,6 +148,8 @@ class Prepared:
     """Rows dropped because a value is missing."""
     repeated: int
     """Rows dropped because their time stamp repeats an earlier one."""
+    braked: BrakedRows
+    """Rows of the recording dropped because they have closed brakes."""
 
 
 def prepare(
@@ -159,9 +162,14 @@ def prepare(
     """
     t, episode, missing = _or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing()
     numbers = np.zeros(raw.rows) if episode is None else episode
+
+    def read(quantity: str, joint: int) -> Array:
+        return raw.read(column(quantity, joint))
+
     try:
-        damaged = find_corrupt_rows(t, numbers, raw.n_joints, lambda *which: raw.read(column(*which)), raw.quantities)
-        made = plan(t, episode, missing, raw.quantities, recipe, damaged.rows)
+        damaged = find_corrupt_rows(t, numbers, raw.n_joints, read, raw.quantities)
+        braked = find_braked_rows(t, numbers, raw.n_joints, read)
+        made = plan(t, episode, missing, raw.quantities, recipe, damaged.rows, braked.rows)
     except (CorruptRowsError, PreparationError) as error:
         raise invalid_data(error.field, error.value, error.expected, str(error)) from None
     if len(made) < min_samples:
@@ -173,7 +181,7 @@ def prepare(
     staged.append({TIME: made.t, EPISODE: made.episode.astype(np.float64)})
 
     def columns(joint: int) -> Iterator[tuple[str, Array]]:
-        return made.columns(lambda quantity: raw.read(column(quantity, joint)))
+        return made.columns(lambda quantity: read(quantity, joint))
 
     for joint in range(raw.n_joints):
         for name, values in columns(joint):
@@ -188,6 +196,7 @@ def prepare(
         gaps=made.gaps,
         missing=made.missing,
         repeated=made.repeated,
+        braked=braked,
     )
 
 

@@ -46,7 +46,7 @@ from service.datasets.report.signals import (
     thin,
     white_noise,
 )
-from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
+from service.datasets.staging import EPISODE, QUANTITIES, TIME, Prepared, Staged, column
 
 
 def make_report(
@@ -103,6 +103,7 @@ def make_report(
         },
         torque_noise_estimate=samples.noise,
         warnings=warned
+        + _closed_brakes(raw, prepared)
         + [each.text for each in remedies]
         + collect_warnings(times.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows),
         reading=reading,
@@ -178,6 +179,16 @@ def _analyse_raw(raw: Staged, times: RecordedTimes, limits: Limits | None) -> _R
             )
         )
     return out
+
+
+def _closed_brakes(raw: Staged, prepared: Prepared) -> list[str]:
+    """Return a warning of rows with closed brakes, if there are any."""
+    braked = prepared.braked
+    if not braked.joints:
+        return []
+    t = raw.read(TIME)
+    spans = [(float(t[first] - np.nanmin(t)), float(t[last] - np.nanmin(t))) for first, last in braked.stretches]
+    return [texts.closed_brakes([raw.joint_names[joint] for joint in braked.joints], float(braked.rows.mean()), spans)]
 
 
 def _share(level: float | None, values: Array) -> float | None:

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from service.foundation.text import percent
 
-MAX_LISTED = 8
-"""Max names that a sentence lists."""
+MAX_LISTED, MAX_SPANS = 8, 3
+"""Max names, and max stretches of time, that a sentence lists."""
 
 
 def list_names(names: Iterable[str]) -> str:
@@ -32,6 +32,18 @@ def uneven_times(jitter: float) -> str:
 def missing_values(missing: int, rows: int) -> str:
     """Warn of rows that lack a value."""
     return f"{missing} of {rows} rows lack a value and were dropped."
+
+
+def closed_brakes(joints: Sequence[str], share: float, spans: Sequence[tuple[float, float]]) -> str:
+    """Warn of rows with closed brakes. spans: first and last time of each stretch, s from the start."""
+    shown = [f"{first:.1f} s to {last:.1f} s" for first, last in spans[:MAX_SPANS]]
+    more = [f"{len(spans) - MAX_SPANS} more"] if len(spans) > MAX_SPANS else []
+    return (
+        f"{list_names(joints)}: no torque at standstill in {percent(share)} of the rows "
+        f"({list_names(shown + more)} after the start), although gravity needs torque there. The brakes were probably "
+        "closed. These rows were left out, because a model must not be trained on them. Record only while the drives "
+        "hold the arm."
+    )
 
 
 def beyond_limits(quantities: str, shares: Mapping[str, float]) -> str:

@@ -8,10 +8,13 @@ import pytest
 
 from lipcore.data.signals import low_pass, noise_level
 from lipcore.preparation.recipe import Recipe
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Simulation, simulate
 from service.contract.datasets import DatasetReport
 from service.datasets.report.making import make_report
 from service.datasets.report.texts import list_names
 from service.datasets.staging import prepare
+from tests.lipcore.braked import close_brakes
 from tests.service.datasets.report_data import profile_of, recording, report_on, staged
 
 
@@ -58,3 +61,19 @@ def test_shortest_recordings_get_a_report(tmp_path: Path, rows: int) -> None:
 
 def test_long_lists_of_names_are_shortened() -> None:
     assert list_names("abcdefghijk") == "a, b, c, d, e, f, g, h and 3 more"
+
+
+def test_rows_with_closed_brakes_are_left_out_and_reported(tmp_path: Path) -> None:
+    robot = load_robot("ur10")
+    samples, braked = close_brakes(simulate(robot, Simulation(2500, 50.0, course="rests", motion="full"), 5))
+    columns = {name: getattr(samples, name) for name in ("t", "q", "dq", "ddq", "tau")}
+    report = report_on(tmp_path, samples.joint_names, columns, recipe=Recipe(filtering="never"))
+    assert report.rows == pytest.approx(len(samples) - braked.sum(), abs=0.05 * braked.sum())
+    (step,) = (step for step in report.steps if step["step"] == "leave_out")
+    assert (step["why"], step["rows"]) == ("braked", len(samples) - report.rows)
+    (warning,) = (each for each in report.warnings if "brakes" in each)
+    assert warning.startswith(
+        f"{samples.joint_names[1]}: no torque at standstill in {step['rows'] / 25:.0f} % of the rows"
+    )
+    first = int(np.flatnonzero(braked)[5])  # the first stretch has one row
+    assert f"({samples.t[first]:.1f} s to " in warning
