@@ -15,7 +15,7 @@ from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_from_torque
 from lipcore.kernels.drive.kernel import Bodies, Drive, Elements
 from lipcore.kernels.drive.play import element_widths
-from lipcore.kernels.drive.terms import BASE_TERMS, check_kinds
+from lipcore.kernels.drive.terms import BASE_TERMS, MAX_GAIN_STD, check_kinds
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.vocabulary import DriveKind, GeometryMode, JointType
@@ -127,7 +127,7 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind, joints: NDArray[n
     """Return the same problem with another kind of friction. The load is that of a point's bodies.
 
     joints: (n,), those that have the kind. The prior std of a new term is that of the Coulomb term, for the term's
-    largest size in the samples.
+    largest size in the samples; that of a gain is MAX_GAIN_STD.
     """
     n, first, before = problem.n_joints, problem.bodies, problem.drive
     kinds, elements = check_kinds((*before.kinds, kind)), before.elements
@@ -146,6 +146,8 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind, joints: NDArray[n
         for place, term in enumerate(terms):
             if term in known:
                 values[:, place] = of_joint[:, known.index(term)]
+            elif term == "gain":
+                values[:, place] = MAX_GAIN_STD
             else:
                 values[:, place] = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[:, place], 1e-3)
     return replace(
@@ -165,7 +167,7 @@ def _carried(problem: Problem, point: Point) -> Bodies:
 
 def with_load(problem: Problem, point: Point) -> Problem:
     """Return the same problem with the load of a point's bodies."""
-    if "load" not in problem.drive.kinds:
+    if not problem.drive.needs_bodies:
         return problem
     drive = replace(problem.drive, bodies=_carried(problem, point))
     return replace(problem, drive=drive, friction=drive.features(problem.motions))

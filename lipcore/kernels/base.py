@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from array_api_compat import array_namespace, device
+from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion
 from lipcore.extras import import_extra
@@ -227,6 +228,11 @@ class LinearKernel(TorqueKernel):
     The weights are independent a priori: their covariance Λ is diagonal.
     """
 
+    @property
+    def whole(self) -> LinearKernel:
+        """The kernel that has these weights: itself, unless it is a `PartialKernel`."""
+        return self
+
     @abstractmethod
     def regressor(self) -> Regressor:
         """Return the regressor that computes Φ for single queries."""
@@ -276,6 +282,38 @@ class LinearKernel(TorqueKernel):
         """Return Φ of all torques, sample by sample, (N n, p)."""
         features = self.features(x)
         return features.reshape(-1, features.shape[-1])
+
+
+class PartialKernel(LinearKernel):
+    """The torque of some of a linear kernel's weights. mask: of these weights, (p,)."""
+
+    def __init__(self, whole: LinearKernel, mask: NDArray[np.bool_]) -> None:
+        self.n_joints, self._whole, self._mask = whole.n_joints, whole, mask
+
+    @property
+    def whole(self) -> LinearKernel:
+        """The kernel that has these weights."""
+        return self._whole
+
+    def regressor(self) -> Regressor:
+        """Return the regressor of all weights."""
+        return self._whole.regressor()
+
+    def features(self, x: Motion) -> Array:
+        """Return Φ at each sample, (N, n, p), zero for the other weights."""
+        return self._whole.features(x) * self._mask
+
+    def variances(self, params: Params) -> Array:
+        """Return the prior variances of all weights, (p,)."""
+        return self._whole.variances(params)
+
+    def prior_weights(self) -> Array | None:
+        """Return the prior mean of all weights, (p,)."""
+        return self._whole.prior_weights()
+
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
+        """Return the initial hyperparameters of all weights."""
+        return self._whole.initial(motion, tau)
 
 
 class SumKernel(TorqueKernel):

@@ -34,7 +34,7 @@ _TORQUES: dict[ComponentName, dict[str, float]] = {
 }
 """Components as sums of torques at standstill, moving without acceleration, and accelerating from standstill."""
 LOAD_STEPS = 4
-"""Steps of forward dynamics. Each reduces the remaining torque to a few percent: the share of the load in friction."""
+"""Steps of forward dynamics. Each reduces the remaining torque to a few percent: the share that the load determines."""
 
 
 class UnavailableComponentError(ValueError):
@@ -64,6 +64,7 @@ def components(
     """Return the posterior of components at N queries, by name.
 
     Only `friction` and `forward_dynamics` contain friction. It depends on the deflections of the motion, if known.
+    Torques and the inertia matrix are those that the recording would read, with its gains; energies are physical.
 
     - `inertia_matrix` (N, n, n): M(q), kg·m² if both joints are revolute;
     - `inertial`, `coriolis`, `gravity`, `friction` (N, n): M(q) ddq, c(q, dq), g(q), f(dq); the torque is their sum;
@@ -76,13 +77,16 @@ def components(
     """
     asked = _check(model, motion, names, tau)
     posterior, terms = model.posterior, _dynamics_terms(model.estimator)
+    drive = model.estimator.terms.get("friction")
     estimates: dict[str, Estimate] = {}
     torques = [name for name in asked if name in _TORQUES or name == "inertia_matrix"]
     if torques:
         fixed = _with_fixed_deflections(model.estimator, motion)
-        estimates |= _torque_parts(posterior, SumKernel(*terms), fixed, torques)
+        gains = [drive.gain()] if isinstance(drive, DriveKernel) and "gain" in drive.drive.kinds else []
+        estimates |= _torque_parts(posterior, SumKernel(*terms, *gains), fixed, torques)
     if "friction" in asked:
-        friction = model.estimator.terms["friction"]
+        assert drive is not None  # `_check` has checked it
+        friction = drive.friction() if isinstance(drive, DriveKernel) else drive
         estimates["friction"] = combine_torques(posterior, friction, [motion], np.eye(model.n_joints))
     energetic = _energy_terms(model.estimator)
     if "kinetic_energy" in asked:
@@ -103,9 +107,9 @@ def reference_posture(model: TorqueModel) -> Array:
 def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate:
     """Return the acceleration under torque tau (N, n) N·m, ddq = M(q)⁻¹ (tau − c − g − f), (N, n) rad/s².
 
-    motion.ddq is not read. LOAD_STEPS fixed-point steps solve for friction that grows with the load, which depends on
-    ddq. The uncertainty is of first order: an error ε of the whole torque at (q, dq, ddq) changes ddq by −M⁻¹ ε. This
-    includes the error of M, and it is valid while the uncertainty of M is small compared with M.
+    motion.ddq is not read. LOAD_STEPS fixed-point steps solve for friction and gains that depend on the load, and so
+    on ddq. The uncertainty is of first order: an error ε of the whole torque at (q, dq, ddq) changes ddq by −M⁻¹ ε.
+    This includes the error of M, and it is valid while the uncertainty of M is small compared with M.
     Raise IndefiniteInertiaError if M is not positive definite.
     """
     posterior = model.posterior
@@ -116,7 +120,7 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
     if not (lowest > 0).all():
         raise IndefiniteInertiaError(int(np.argmin(lowest > 0)))
     ddq = np.zeros_like(motion.q)
-    for _ in range(LOAD_STEPS if isinstance(friction, DriveKernel) and "load" in friction.drive.kinds else 1):
+    for _ in range(LOAD_STEPS if isinstance(friction, DriveKernel) and friction.drive.needs_bodies else 1):
         left = tau - posterior.mean(replace(fixed, ddq=ddq))
         ddq = ddq + np.linalg.solve(inertia, left[:, :, None])[:, :, 0]
     covariance = posterior.predict(replace(motion, ddq=ddq)).covariance

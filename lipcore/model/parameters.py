@@ -61,6 +61,9 @@ class Friction:
     load: Array | None = None
     """Friction per torque that the bodies need; None if the model does not have it."""
     load_std: Array | None = None
+    gain: Array | None = None
+    """Error of the torque's gain: 0.05 if torque reads 5 % too high for the masses; None if there is none."""
+    gain_std: Array | None = None
     breakaway: Array | None = None
     """Friction of a joint that begins to slip, N·m (N); None if friction remembers nothing."""
     breakaway_std: Array | None = None
@@ -193,7 +196,7 @@ def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Seque
     out: dict[str, Any] = {
         "friction": {
             name: {"mean": getattr(friction, name).tolist(), "std": getattr(friction, f"{name}_std").tolist()}
-            for name in ("viscous", "coulomb", "offset", "stribeck", "load", "breakaway", "stiffness")
+            for name in ("viscous", "coulomb", "offset", "stribeck", "load", "gain", "breakaway", "stiffness")
             if getattr(friction, name) is not None
         }
     }

@@ -300,9 +300,9 @@ class LinearisedCarrier:
 
     @cached_property
     def _friction(self) -> tuple[DriveKernel, DriveKernel] | None:
-        """The drive without and with the payload in its load; None if friction does not grow with the load."""
+        """The drive without and with the payload in its load; None if it does not depend on the load."""
         friction = self.carrier.model.estimator.terms["friction"]
-        if not isinstance(friction, DriveKernel) or "load" not in friction.drive.kinds:
+        if not isinstance(friction, DriveKernel) or not friction.drive.needs_bodies:
             return None
         return friction, DriveKernel(self._arm.arm.friction)
 

@@ -57,6 +57,15 @@ def describe_unidentifiable(parameters: Mapping[str, Sequence[str]], calibrated:
     return f"{count} geometry parameters are not identifiable from this recording. They {values} ({listed})."
 
 
+def describe_gains(errors: Mapping[str, tuple[float, float]]) -> str:
+    """Return the warning about gains, by joint: mean and standard deviation of the error, as shares of the torque."""
+    listed = [
+        f"{joint} reads {100 * abs(mean):.0f} ± {100 * std:.0f} % too {'high' if mean > 0 else 'low'}"
+        for joint, (mean, std) in errors.items()
+    ]
+    return f"The torque does not fit the masses: {list_joints(listed)}. Check the torque constants or sensors."
+
+
 def describe_fallback(joints: Sequence[str], factor: float) -> str:
     """Return the warning about joints that fall back at `factor` times the range and speed of the recording."""
     listed = list_with_and(_cut(joints))

@@ -19,6 +19,8 @@ from lipcore.posterior.compression import checks
 
 RANGE_FACTOR = 2.0
 """Factor on the range and speed of the recording, at which alternative arms and shares of the fallback are compared."""
+MIN_GAIN_ERROR = 0.03
+"""Min error of a gain for a warning, if it also exceeds two of its standard deviations."""
 REFIT_ERROR = "refit_error"
 """Entry of a fit's report: the error of the last fit, on all rows."""
 
@@ -66,6 +68,8 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
         return [*out, together] if moved_together else out
     if len(arm.alternatives) > 1:
         out.append(_alternatives(model))
+    if gains := _wrong_gains(model, parameters):
+        out.append(texts.describe_gains(gains))
     if fit.get("search_ended") == "time":
         out.append(texts.describe_search_limit(float(model.options.get("search_seconds", 0.0))))
     if fit.get("search_explained") is False:
@@ -79,6 +83,13 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
     if (several or arm.alternatives) and moved_together:
         out.append(together)
     return out
+
+
+def _wrong_gains(model: TorqueModel, parameters: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return mean and standard deviation of the errors of wrong gains, by joint."""
+    gain = parameters["friction"].get("gain", {"mean": (), "std": ()})
+    found = zip(model.joint_names, gain["mean"], gain["std"], strict=False)
+    return {joint: (mean, std) for joint, mean, std in found if abs(mean) > max(MIN_GAIN_ERROR, 2 * std)}
 
 
 def _fallback(model: TorqueModel) -> list[str]:

@@ -61,7 +61,7 @@ class Basis:
         start = len(self.outputs)
         for each in self.linear:
             size = len(each.variances(self.params))
-            if each is linear:
+            if each is linear.whole:
                 return slice(start, start + size)
             start += size
         raise ValueError("the linear term does not belong to this basis")

@@ -1,4 +1,4 @@
-"""The torque prior of the drive: the joints' friction, linear in independent coefficients."""
+"""The torque prior of the drive: friction and gain of each joint, linear in independent coefficients."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from functools import cached_property
 
 import numpy as np
 from array_api_compat import array_namespace
+from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.base import LinearKernel, Params, Regressor
+from lipcore.kernels.base import LinearKernel, Params, PartialKernel, Regressor
 from lipcore.kernels.drive.terms import SHAPE_SPEEDS, SIGN_WIDTH, STRIBECK_SPEED, check_kinds, drive_terms
 from lipcore.kernels.fast.drive import drive_queries, drive_query, drive_size, linear_features
 from lipcore.kernels.fast.views import Memory
@@ -19,7 +20,7 @@ from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 
 @dataclass(frozen=True)
 class Bodies:
-    """The bodies that the kind `load` needs."""
+    """The bodies that the kinds `load` and `gain` need."""
 
     geometry: Geometry
     """Geometry, base to tip."""
@@ -51,7 +52,11 @@ class Drive:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kinds", check_kinds(self.kinds))
-        for kind, needs, given in (("load", "bodies", self.bodies), ("play", "elements", self.elements)):
+        for kind, needs, given in (
+            ("load", "bodies", self.bodies),
+            ("gain", "bodies", self.bodies),
+            ("play", "elements", self.elements),
+        ):
             if kind in self.kinds and given is None:
                 raise ValueError(f"drive kind {kind!r} needs {needs}")
 
@@ -59,6 +64,11 @@ class Drive:
     def terms(self) -> tuple[str, ...]:
         """Names of a joint's terms, (f,)."""
         return drive_terms(self.kinds)
+
+    @property
+    def needs_bodies(self) -> bool:
+        """Whether terms depend on the torque that the bodies need."""
+        return not {"load", "gain"}.isdisjoint(self.kinds)
 
     @cached_property
     def regressor(self) -> DriveRegressor:
@@ -75,9 +85,9 @@ class Drive:
 
 
 class DriveKernel(LinearKernel):
-    """Friction tau_i = Σ_k f_ik φ_k with the terms φ of `lipcore.kernels.drive.terms`.
+    """Friction and gain tau_i = Σ_k f_ik φ_k with the terms φ of `lipcore.kernels.drive.terms`.
 
-    The load |τ| is the torque that the bodies need, `newton_euler.rigid_body_torque`: a function of the query, not of
+    The load τ is the torque that the bodies need, `newton_euler.rigid_body_torque`: a function of the query, not of
     the weights.
 
     Weights: (f n,), joint by joint; `drive.terms` contains the names of a joint's f. Hyperparameter:
@@ -90,6 +100,19 @@ class DriveKernel(LinearKernel):
     def regressor(self) -> Regressor:
         """Return the regressor that computes the terms of single queries."""
         return self.drive.regressor
+
+    def friction(self) -> PartialKernel:
+        """Return the part that is friction."""
+        return PartialKernel(self, ~self._gains)
+
+    def gain(self) -> PartialKernel:
+        """Return the part by which torque reads too high or too low."""
+        return PartialKernel(self, self._gains)
+
+    @property
+    def _gains(self) -> NDArray[np.bool_]:
+        """Mask of the weights of the gain, (f n,)."""
+        return np.tile([term == "gain" for term in self.drive.terms], self.n_joints)
 
     def variances(self, params: Params) -> Array:
         """Return the prior variances of the weights, (f n,)."""
@@ -116,7 +139,7 @@ class DriveRegressor(Regressor):
         self.n_joints = n = drive.n_joints
         self._terms = len(drive.terms)
         self.size = self._terms * n
-        bodies, elements = drive.bodies if "load" in drive.kinds else None, drive.elements
+        bodies, elements = drive.bodies if drive.needs_bodies else None, drive.elements
         self._order = np.arange(n) if bodies is None else bodies.order.astype(np.int64)
         self._kinds = np.array([int(kind in drive.kinds) for kind in DRIVE_KINDS])
         self._constants = np.array([SIGN_WIDTH, STRIBECK_SPEED, *SHAPE_SPEEDS])

@@ -1,4 +1,4 @@
-"""The terms of a joint's friction torque, one coefficient each.
+"""The terms of a joint's drive, friction and gain, one coefficient each.
 
 With the velocity v, its smoothed sign s = tanh(v / w), and the torque τ that the bodies need at this joint:
 
@@ -9,6 +9,7 @@ With the velocity v, its smoothed sign s = tanh(v / w), and the torque τ that t
     speed     tanh(v / 0.1), tanh(v / 0.4), tanh(v / 1.5), v |v|             it is not linear in speed
     sides     |s|, |v|                                                       it differs between the directions
     load      |τ| s, |τ| v                                                   it grows with the torque carried
+    gain      τ                                                              torque reads too high or too low
     play      e₁ … e_K                                                       it remembers where the joint came from
 
 The deflections e of the play elements are those of `lipcore.kernels.drive.play`.
@@ -34,12 +35,15 @@ SHAPE_SPEEDS = (0.1, 0.4, 1.5)
 """Speeds of the shapes tanh(v / speed), rad/s (m/s)."""
 SUMMARY_SPEEDS = (0.1, 1.0)
 """Speeds between which a report states friction as a line, rad/s (m/s)."""
+MAX_GAIN_STD = 0.1
+"""Max prior standard deviation of a gain: that of nominal torque constants. Torque sensors are better."""
 BASE_TERMS = ("viscous", "coulomb", "offset")
 KIND_TERMS: dict[DriveKind, tuple[str, ...]] = {
     "stribeck": ("stribeck",),
     "speed": ("speed_slow", "speed_medium", "speed_fast", "speed_square"),
     "sides": ("side", "side_viscous"),
     "load": ("load", "load_viscous"),
+    "gain": ("gain",),
     "play": tuple(f"play_{number}" for number in range(1, len(ELEMENTS) + 1)),
 }
 
@@ -63,7 +67,8 @@ def drive_features(
 ) -> Array:
     """Return the terms of N velocities, (f, N, n).
 
-    dq: (N, n) rad/s (m/s); load: (N, n) N·m (N), the absolute torque that the bodies need, for the kind `load`;
+    dq: (N, n) rad/s (m/s); load: (N, n) N·m (N), the torque that the bodies need, for the kinds `load`
+    and `gain`;
     deflections: (N, K, n), expected ones, for the kind `play`.
     """
     sign, speed = np.tanh(dq / SIGN_WIDTH), np.abs(dq)
@@ -76,7 +81,10 @@ def drive_features(
         parts += [np.abs(sign), speed]
     if "load" in kinds:
         assert load is not None  # the caller computes it
-        parts += [load * sign, load * dq]
+        parts += [np.abs(load) * sign, np.abs(load) * dq]
+    if "gain" in kinds:
+        assert load is not None
+        parts.append(load)
     if "play" in kinds:
         assert deflections is not None  # the caller computes them
         parts += list(deflections.swapaxes(0, 1))
@@ -92,19 +100,21 @@ def passing_row(kinds: Sequence[DriveKind]) -> Array:
 def summary_rows(kinds: Sequence[DriveKind]) -> dict[str, Array]:
     """Return the row, (f,), that turns a joint's coefficients into each number of a report.
 
-    `viscous`, `coulomb`, `offset`, and `stribeck` and `load` if they are modelled. `coulomb` includes the play
+    `viscous`, `coulomb`, `offset`, and `stribeck`, `load` and `gain` if they are modelled. `coulomb` includes the play
     elements, which have slipped in steady motion. With `speed` or `sides`, several terms are similar. `viscous` is then
     the slope of friction from SUMMARY_SPEEDS[0] to SUMMARY_SPEEDS[1], `coulomb` the friction that this line has at
     standstill, and `offset` the mean of both directions at the lower speed.
     """
     terms = drive_terms(kinds)
-    rows = {name: np.array([float(term == name) for term in terms]) for name in (*BASE_TERMS, "stribeck", "load")}
+    rows = {
+        name: np.array([float(term == name) for term in terms]) for name in (*BASE_TERMS, "stribeck", "load", "gain")
+    }
     rows = {name: row for name, row in rows.items() if row.any()}
     slipped = np.array([float(term in KIND_TERMS["play"]) for term in terms])
     if not {"speed", "sides"} & set(kinds):
         return {**rows, "coulomb": rows["coulomb"] + slipped}
     low, high = SUMMARY_SPEEDS
-    counted = np.array([term not in ("stribeck", *KIND_TERMS["load"]) for term in terms])
+    counted = np.array([term not in ("stribeck", *KIND_TERMS["load"], "gain") for term in terms])
     speeds, still = np.array([[low], [high]]), np.zeros((2, len(ELEMENTS), 1))
     ahead, back = (
         drive_features(each, kinds, np.zeros_like(each), still + np.sign(each[0]))[:, :, 0] * counted[:, None]

@@ -2,9 +2,9 @@
 
 Common arguments:
 
-- kinds: (5,), one for each of `DRIVE_KINDS`: 1 if the drive has it, else 0;
+- kinds: (6,), one for each of `DRIVE_KINDS`: 1 if the drive has it, else 0;
 - memory: `Memory` of the arm's constants, gravity and parameters, with `drive_size` elements to work in; without the
-  kind `load`, only n elements;
+  kinds `load` and `gain`, only n elements;
 - order: (n,), the data's joint at each place of the chain;
 - elements: (K + 1, n), widths of the play elements and the usual acceleration; (1, n) without the kind `play`.
 """
@@ -27,12 +27,12 @@ from lipcore.kernels.fast.compile import brief, compiled, inlined
 from lipcore.kernels.fast.play import expected_deflection
 from lipcore.kernels.fast.views import numbers
 
-STRIBECK, SPEED, SIDES, LOAD, PLAY = range(5)
+STRIBECK, SPEED, SIDES, LOAD, GAIN, PLAY = range(6)
 """Places of the kinds."""
 
 
 def drive_size(n: int) -> int:
-    """Return the number of elements that the kind `load` works in."""
+    """Return the number of elements that the kinds `load` and `gain` work in."""
     return (n + 1) * WORK + n
 
 
@@ -71,9 +71,12 @@ def _write_terms(
         out[row + 1, column] = speed
         row += 2
     if kinds[LOAD]:
-        out[row, column] = load * sign
-        out[row + 1, column] = load * velocity
+        out[row, column] = abs(load) * sign
+        out[row + 1, column] = abs(load) * velocity
         row += 2
+    if kinds[GAIN]:
+        out[row, column] = load
+        row += 1
     if kinds[PLAY]:
         for k in range(elements.shape[0] - 1):
             out[row + k, column] = expected_deflection(motion, joint, k, elements)
@@ -81,8 +84,8 @@ def _write_terms(
 
 @compiled
 def _write_load(memory: Array, order: Indices, kinds: Indices, motion: Array, load: Array) -> None:
-    """Write the absolute torque that the bodies need at each joint, (n,), if it is needed."""
-    if not kinds[LOAD]:
+    """Write the torque that the bodies need at each joint, (n,), if a kind needs it."""
+    if not (kinds[LOAD] or kinds[GAIN]):
         return
     n = order.shape[0]
     place = n * CONSTANTS
@@ -92,8 +95,6 @@ def _write_load(memory: Array, order: Indices, kinds: Indices, motion: Array, lo
     kinematics(numbers(memory, 0, (n, CONSTANTS)), memory[place:body], motion, order, work)
     bodies(numbers(memory, 0, (n, CONSTANTS)), numbers(memory, body, (n, PARAMETERS)), work)
     torques(order, work, load)
-    for j in range(n):
-        load[j] = abs(load[j])
 
 
 @brief

@@ -18,7 +18,7 @@ from lipcore.data.motion import Array, Motion
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS, with_deflections
 from lipcore.kernels.drive.terms import KIND_TERMS, drive_features, drive_terms, summary_rows
-from lipcore.model.dynamics import forward_dynamics
+from lipcore.model.dynamics import components, forward_dynamics
 from lipcore.model.parameters import friction_coefficients, weight_posterior
 from lipcore.robots.dirt import MAXWELL_ELEMENTS, Dirt
 from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate, usual_torque
@@ -30,6 +30,8 @@ from tests.lipcore.files.test_persistence import edit_tensor
 GEOMETRY, BODIES, ROBOT = arm("RRR", 31)
 SHARE = 0.08
 """Friction per torque that the bodies need."""
+GAINS = np.array([0.0, 0.12, -0.08])
+"""Errors of the gains."""
 MAXWELL = Dirt(load=0.5, position=0.0, warmth=0.0, ripple=0.0, gain=0.0, noise=0.005, seed=3, drive="maxwell")
 """Friction that the terms of the drive can express, with noise of 0.5 % of the usual torque."""
 
@@ -45,6 +47,7 @@ def simulate_friction(seed: int, kind: str = "none") -> Samples:
         "falling load": -SHARE * load * sign,
         "speed": 0.4 * np.tanh(samples.dq / 0.4) - 0.2 * samples.dq * speed,
         "sides": 0.3 * np.abs(sign) - 0.1 * speed,
+        "gain": GAINS * inverse_dynamics(ROBOT, samples.q, samples.dq, samples.ddq),
     }[kind]
     return replace(samples, tau=samples.tau + 0.4 * sign + more)
 
@@ -72,7 +75,7 @@ def pose(samples: Samples) -> tuple[Problem, Point]:
     return problem, problem.with_noise(problem.at(GEOMETRY.canonical(), 0.05 * samples.tau.std(axis=0)))
 
 
-@pytest.mark.parametrize("kind", ["load", slow("speed"), slow("sides")])
+@pytest.mark.parametrize("kind", ["load", "gain", slow("speed"), slow("sides")])
 def test_supported_kind_is_chosen_and_predicts_better(kind: DriveKind, monkeypatch: pytest.MonkeyPatch) -> None:
     model, unseen = train_friction(kind), simulate_friction(2, kind)
     assert kind in str(model.fit["drive"])
@@ -93,6 +96,23 @@ def test_share_of_the_load_is_recovered() -> None:
     assert (np.abs(friction.load - SHARE) < 3 * friction.load_std).all()
     assert (friction.load_std < 0.3 * SHARE).any()
     assert (np.abs(friction.coulomb - 0.4) < 3 * friction.coulomb_std).all()
+
+
+def test_gains_are_recovered_and_belong_to_the_bodies() -> None:
+    model, unseen = train_friction("gain"), simulate_friction(2, "gain")
+    assert model.fit["drive"] == "gain"
+    friction = friction_coefficients(model.posterior, model.estimator)
+    assert friction.gain is not None
+    assert friction.gain_std is not None
+    # without known masses only ratios of gains are identifiable
+    ratios, truth = ((1 + gain) / (1 + gain[1]) for gain in (friction.gain, GAINS))
+    np.testing.assert_allclose(ratios, truth, atol=0.03)
+    motion = Motion.from_arrays(unseen.q[:20], unseen.dq[:20], unseen.ddq[:20])
+    parts = components(model, motion, ("gravity", "coriolis", "inertial", "friction"))
+    np.testing.assert_allclose(sum(each.mean for each in parts.values()), model.posterior.mean(motion), atol=1e-9)
+    still = np.zeros_like(motion.q)
+    gravity = (1 + GAINS) * inverse_dynamics(ROBOT, motion.q, still, still)
+    np.testing.assert_allclose(parts["gravity"].mean, gravity, atol=0.05 * np.abs(gravity).max())
 
 
 def test_play_and_share_of_the_load_are_recovered() -> None:
@@ -214,7 +234,9 @@ def test_report_of_curved_friction_is_a_line_through_its_curve() -> None:
 
 
 def test_unknown_kinds_and_a_load_without_arm_are_rejected() -> None:
-    with pytest.raises(ValueError, match="drive kind is 'cogging', expected one of stribeck, speed, sides, load, play"):
+    with pytest.raises(
+        ValueError, match="drive kind is 'cogging', expected one of stribeck, speed, sides, load, gain, play"
+    ):
         Drive(3, ("cogging",))
     with pytest.raises(ValueError, match="'load' needs bodies"):
         Drive(3, ("load",))
@@ -254,7 +276,7 @@ def test_model_with_play_is_stored_and_restored(tmp_path: Path) -> None:
         ("arm/acceleration", np.ones(2), "'arm/acceleration' is wrong"),
         ("arm/acceleration", np.array([1.0, 0.0, 1.0]), "'arm/acceleration' is wrong"),
         ("arm/acceleration", np.array([1.0, np.nan, 1.0]), "'arm/acceleration' is not made of finite"),
-        ("arm/drive", np.array([0.0, 0.0, 0.0, 1.0, 0.0]), "'arm/acceleration' is wrong"),
+        ("arm/drive", np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), "'arm/acceleration' is wrong"),
         ("misfit", np.ones((15, 3)), r"'misfit' has shape \(15, 3\), expected \(16, 3\)"),
         ("misfit", np.ones((16, 2)), r"'misfit' has shape \(16, 2\), expected \(16, 3\)"),
         ("misfit", -np.ones((16, 3)), "'misfit' has a number below zero"),

@@ -41,6 +41,7 @@ export function massTable({ joint_names: names, joint_types: types, parameters }
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },
     ...(friction.stribeck ? [{ label: "Stribeck, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
     ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: (joint) => pair(friction.load, joint) }] : []),
+    ...(friction.gain ? [{ label: "Gain error", numeric: true, cell: (joint) => pair(friction.gain, joint) }] : []),
     ...(friction.breakaway ? [{ label: "Breakaway, N·m", numeric: true, cell: (joint) => pair(friction.breakaway, joint) }] : []),
     ...(friction.stiffness ? [{ label: "Presliding, N·m/rad", numeric: true, cell: (joint) => pair(friction.stiffness, joint) }] : []),
     { label: "Unidentifiable", cell: (joint) => (inertia.bodies[joint].undetermined ?? []).map((each) => each.replace("_", " ")).join(", ") || "–" },

@@ -64,13 +64,14 @@ function frictionCard({ joint_names: names, joint_types: types, parameters }) {
     { label: "Offset, N·m", numeric: true, cell: value("offset") },
     ...(friction.stribeck ? [{ label: "Stribeck, N·m", numeric: true, cell: value("stribeck") }] : []),
     ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: value("load") }] : []),
+    ...(friction.gain ? [{ label: "Gain error", numeric: true, cell: value("gain") }] : []),
     ...(friction.breakaway ? [{ label: "Breakaway, N·m", numeric: true, cell: value("breakaway") }] : []),
     ...(friction.stiffness ? [{ label: "Presliding, N·m/rad", numeric: true, cell: value("stiffness") }] : []),
   ];
   return card(
     "Friction parameters",
     table(columns, names.map((_name, joint) => joint), { caption: `Mean ± one standard deviation${sliding}, as trained` }),
-    h("p", { class: "hint" }, "Friction is viscous · dq + Coulomb · sign(dq) + offset; the offset includes every other constant torque. ≈ 0: less than two standard deviations from zero, so not significant. The share of the load is friction per torque that the bodies need. Breakaway is the friction of a joint that begins to slip, presliding its stiffness before that. Values as trained, without online learning."),
+    h("p", { class: "hint" }, "Friction is viscous · dq + Coulomb · sign(dq) + offset; the offset includes every other constant torque. ≈ 0: less than two standard deviations from zero, so not significant. The share of the load is friction per torque that the bodies need. A gain error of 0.05 means that torque reads 5 % too high for the masses. Breakaway is the friction of a joint that begins to slip, presliding its stiffness before that. Values as trained, without online learning."),
   );
 }
 
