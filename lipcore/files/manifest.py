@@ -96,6 +96,7 @@ class Fit(TypedDict, total=False):
     """Of versions of earlier releases, as `friction_terms`."""
     drive: Annotated[str, Meta(pattern=r"^[a-z, ]{0,60}$")]
     drive_nats: float
+    mounting: Annotated[str, Meta(pattern=r"^[a-zA-Z, +-]{0,40}$")]
     search_objective: float
     search_starts: Count
     search_hops: Count

@@ -66,6 +66,22 @@ def describe_gains(errors: Mapping[str, tuple[float, float]]) -> str:
     return f"The torque does not fit the masses: {list_joints(listed)}. Check the torque constants or sensors."
 
 
+def describe_mounting(position: str) -> str:
+    """Return the warning about the position of the base. position: of `lipcore.arm.mounting.POSITIONS`."""
+    return f"The recording shows the robot {position}, not as in the URDF. The model follows the recording."
+
+
+def describe_tilt(mean: float, std: float) -> str:
+    """Return the warning about the tilt of the base, degrees."""
+    return f"The base is tilted by {mean:.1f} ± {std:.1f}° from the URDF. Check how the robot is mounted."
+
+
+def describe_zeros(zeros: Mapping[str, tuple[float, float]]) -> str:
+    """Return the warning about zeros of joints: mean and standard deviation by joint, degrees."""
+    listed = list_joints([f"{joint} by {mean:.1f} ± {std:.1f}°" for joint, (mean, std) in zeros.items()])
+    return f"The zero position differs from the URDF: {listed}. Check the calibration of the joints."
+
+
 def describe_fallback(joints: Sequence[str], factor: float) -> str:
     """Return the warning about joints that fall back at `factor` times the range and speed of the recording."""
     listed = list_with_and(_cut(joints))

@@ -21,6 +21,8 @@ RANGE_FACTOR = 2.0
 """Factor on the range and speed of the recording, at which alternative arms and shares of the fallback are compared."""
 MIN_GAIN_ERROR = 0.03
 """Min error of a gain for a warning, if it also exceeds two of its standard deviations."""
+MIN_MOUNTING_DEG = 2.0
+"""The same for the tilt of the base and the zeros of joints."""
 REFIT_ERROR = "refit_error"
 """Entry of a fit's report: the error of the last fit, on all rows."""
 
@@ -70,6 +72,7 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
         out.append(_alternatives(model))
     if gains := _wrong_gains(model, parameters):
         out.append(texts.describe_gains(gains))
+    out += _mounting(model, parameters)
     if fit.get("search_ended") == "time":
         out.append(texts.describe_search_limit(float(model.options.get("search_seconds", 0.0))))
     if fit.get("search_explained") is False:
@@ -87,9 +90,28 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
 
 def _wrong_gains(model: TorqueModel, parameters: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
     """Return mean and standard deviation of the errors of wrong gains, by joint."""
-    gain = parameters["friction"].get("gain", {"mean": (), "std": ()})
+    gain = parameters.get("friction", {}).get("gain", {"mean": (), "std": ()})
     found = zip(model.joint_names, gain["mean"], gain["std"], strict=False)
     return {joint: (mean, std) for joint, mean, std in found if abs(mean) > max(MIN_GAIN_ERROR, 2 * std)}
+
+
+def _mounting(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
+    """Return sentences about a mounting that differs from the URDF's."""
+    fit, out = model.fit, []
+    if "mounting" in fit:
+        out.append(texts.describe_mounting(str(fit["mounting"])))
+    if (tilt := float(fit.get("base_tilt", 0.0))) > MIN_MOUNTING_DEG:
+        std = float(np.degrees(np.linalg.norm(parameters["geometry"]["joints"][0]["turn_std"])))
+        if tilt > 2 * std:
+            out.append(texts.describe_tilt(tilt, std))
+    zeros = {}
+    for joint, (name, kind) in enumerate(zip(model.joint_names, model.joint_types, strict=True), start=1):
+        mean, std = (float(fit.get(f"{key}{joint}", 0.0)) for key in ("zero_", "std_of_zero_"))
+        if kind == "revolute" and abs(mean) > max(MIN_MOUNTING_DEG, 2 * std):
+            zeros[name] = mean, std
+    if zeros:
+        out.append(texts.describe_zeros(zeros))
+    return out
 
 
 def _fallback(model: TorqueModel) -> list[str]:

@@ -346,6 +346,7 @@ def print_of_joints(version: VersionRecord) -> None:
         "right_angle_": "probability that the axis is at a right angle",
         "local_": "remaining squared error after local correction",
         "widened_": "factor on interval width from held-out data",
+        "zero_": "zero position in degrees (mm)",
     }
     for prefix, text in joints.items():
         found = {int(key.removeprefix(prefix)): value for key, value in version.fit.items() if key.startswith(prefix)}

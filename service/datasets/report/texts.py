@@ -169,7 +169,7 @@ def tilted_gravity(joints: Sequence[str], robot: str) -> str:
     )
 
 
-_MOUNTING = "Use a URDF with the base as mounted, or train with geometry=learn."
+_MOUNTING = "Training tries other positions of the base. A URDF with the base as mounted is better."
 
 
 def torque_scale(joints: Sequence[str], factors: Iterable[float], robot: str) -> str:

@@ -85,7 +85,7 @@ function figuresCard(version, from) {
 }
 
 /** Labels of the fit's entries that end with the number of a joint. */
-const OF_JOINTS = { right_angle_: "Probability that the axis is at right angles", local_: "Error after the local correction", widened_: "Intervals widened on held-out data" };
+const OF_JOINTS = { right_angle_: "Probability that the axis is at right angles", local_: "Error after the local correction", widened_: "Intervals widened on held-out data", zero_: "Zero positions, ° (mm)" };
 
 function fit({ fit: report, compact, calibration, conformal, lineage: from }) {
   const found = [
