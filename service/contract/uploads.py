@@ -57,7 +57,8 @@ class UploadQuery(BaseModel):
     effort: Effort | None = Field(
         None,
         description="Meaning of the torque column: measured torque with gravity, commanded torque without gravity, or "
-        "motor current in A, which needs torque constants. By default from the robot's profile",
+        "motor current in A (unknown torque constants are estimated from the masses of `robot`). By default from the "
+        "robot's profile",
     )
     torque_constants: str | None = Field(
         None,

@@ -99,6 +99,12 @@ class Staged:
             raise OSError(f"column {name} has {len(values)} rows on disk, expected {count}")
         return values
 
+    def scale(self, quantity: str, factors: Array) -> None:
+        """Multiply a quantity of each joint by a factor, (n,)."""
+        for joint, factor in enumerate(factors):
+            name = column(quantity, joint)
+            (self.read(name) * factor).tofile(self.folder / f"{name}.f64")
+
     def missing(self) -> NDArray[np.bool_]:
         """Return whether each row lacks a value, (rows,). The result is cached, because all columns are read."""
         if self._missing is None:

@@ -23,6 +23,7 @@ from service.contract.states import ACTIVE
 from service.datasets.mapping.checks import MIN_SAMPLES
 from service.datasets.mapping.reading import Recording
 from service.datasets.options import UploadOptions
+from service.datasets.report.constants import estimate_constants
 from service.datasets.report.making import make_report
 from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, invalid_request, not_found
@@ -63,6 +64,13 @@ def add(
         recording = cage.run(READER, Recording, *arguments, settings=settings, folder=folder)
         raw = Staged.of_others(folder, recording.joint_names, recording.lengths, disk)
         prepared = prepare(raw, folder, options.recipe, MIN_SAMPLES, disk)
+        if recording.facts["effort"] == "current" and recording.facts["torque_constants"] is None:
+            assert profile is not None  # the reader has checked it
+            constants = estimate_constants(prepared, profile)
+            recording.facts["torque_constants"] = constants.values.tolist()
+            recording.noted.append(constants.text)
+            for staged in (raw, prepared.staged):
+                staged.scale("tau", constants.values)
         gravity = recording.torque_convention == "gravity_included"
         report = make_report(raw, prepared, profile, recording.noted, options.recipe, gravity, recording.facts)
         report["upload_sha256"] = sample_file.sha256(upload)

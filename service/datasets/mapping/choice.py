@@ -46,7 +46,7 @@ class TorqueMeaning:
     effort: Effort
     convention: TorqueConvention
     constants: tuple[float, ...] | None
-    """Torque constants of motor currents by joint, N·m/A."""
+    """Torque constants of motor currents by joint, N·m/A; None if they are unknown, or if torque is no current."""
     factors: tuple[float, ...] | None
     """Factors of the torques by joint."""
     notes: tuple[str, ...]
@@ -110,8 +110,9 @@ def interpret_torque(
         raise invalid_data(f"unit of {family.pattern}", wrong, "A or mA because effort is current")
     given: tuple[float, ...] | None = None
     if effort == "current":
-        given = _constants(options, constants, len(units), commanded)
-        notes.append(f"torque is motor current times the torque constants {format_numbers(given)} N·m/A")
+        given = _constants(options, robot, constants, len(units), commanded)
+        if given is not None:
+            notes.append(f"torque is motor current times the torque constants {format_numbers(given)} N·m/A")
     elif options.read.torque_constants is not None:
         raise invalid_request(
             "torque_constants",
@@ -159,8 +160,9 @@ def _effort(
 
 
 def _constants(
-    options: UploadOptions, known: Sequence[float] | None, n: int, commanded: str | None
-) -> tuple[float, ...]:
+    options: UploadOptions, robot: Profile | None, known: Sequence[float] | None, n: int, commanded: str | None
+) -> tuple[float, ...] | None:
+    """Return the torque constants; None if they are to be estimated from the masses of the robot."""
     given = options.read.torque_constants
     if given is not None:
         if len(given) != n:
@@ -169,12 +171,14 @@ def _constants(
             raise invalid_request("torque_constants", list(given), "finite numbers in N·m/A, none of them 0")
         return given
     if known is None or not all(math.isfinite(value) for value in known):
+        if robot is not None:
+            return None
         instead = "" if commanded is None else f", or {columns_hint({'tau': commanded})} to learn commanded torque"
         raise invalid_data(
             "torque_constants",
             "missing",
-            f"{n} numbers in N·m/A, one per joint, because effort is motor current. Set effort=measured if it is torque"
-            f"{instead}",
+            f"{n} numbers in N·m/A, one per joint, because effort is motor current. Name the robot to estimate them "
+            f"from the masses of its URDF. Set effort=measured if it is torque{instead}",
         )
     return tuple(float(value) for value in known)
 

@@ -13,7 +13,9 @@ from sqlalchemy import select
 
 from benchmarks.ingest import recording
 from lipcore.preparation.recipe import Recipe
+from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Simulation, simulate
 from service.datasets.staging import QUANTITIES, Staged, column, prepare
 from service.foundation.settings import Settings
 from service.storage import sample_file
@@ -127,3 +129,27 @@ def test_steps_suffice_to_repeat_the_preparation_by_hand(tmp_path):
     for name, expected in zip(("t", "q2", "dq2", "ddq2"), np.hstack(parts), strict=True):
         np.testing.assert_allclose(prepared.staged.read(name), expected, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(raw.read("q1"), position(t, 0))
+
+
+def test_unknown_torque_constants_are_estimated_from_the_robot(api):
+    constants = np.array([11.0, 12.0, 9.0, 3.0, 2.0, 4.0])
+    dirt = Dirt(gain=0.0, seed=5)
+    moved = simulate(load_robot("ur10"), Simulation(4000, rate=100.0, motion="middle", speed=5.0, dirt=dirt), 72)
+    columns = arrays(moved) | {"tau": moved.tau / constants}
+    dataset = read_created(post(api, npz(**columns), robot="ur10", effort="current"))
+    found = np.array(dataset["report"]["source"]["torque_constants"])
+    # gravity shows the constants of these joints; the others have no more than inertia and friction
+    np.testing.assert_allclose(found[1:4], constants[1:4], rtol=0.2)
+    assert ((found > 0.3 * constants) & (found < 3.0 * constants)).all()
+    [note] = [each for each in dataset["report"]["reading"] if "estimated from the masses of ur10" in each]
+    assert "Set torque_constants if you know them" in note
+    values = service_of(api).storage.files.read_samples(dataset["id"], dataset["joint_names"], dataset["sha256"])
+    np.testing.assert_allclose(values.tau.std(axis=0)[1:4], moved.tau.std(axis=0)[1:4], rtol=0.2)
+
+
+def test_torque_constants_that_the_currents_do_not_show_are_required(api):
+    moved = stream("ur10", samples=600, rate=100.0, seed=71)
+    noise = np.random.default_rng(0).standard_normal(moved.tau.shape)
+    answer = post(api, npz(**arrays(moved) | {"tau": noise}), robot="ur10", effort="current")
+    assert answer.status_code == 422
+    assert "cannot be estimated, because the currents do not show the masses of robot ur10" in answer.text
