@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import fdtri
 
+from lipcore.data import metrics
+from lipcore.data.metrics import quantile
 from lipcore.data.samples import Array
 from lipcore.data.splits import Mask
 from lipcore.model import texts
@@ -21,6 +23,8 @@ class AcceptanceOptions:
     """Min coverage of the 95 % intervals."""
     max_error: float = 0.9
     """Max squared error, as a share of that of the mean torque. The margin is a tenth."""
+    max_width: float = 2.0
+    """Max width of the 95 % intervals, relative to that of errors with the same root mean square, without a note."""
     min_signal: float = 3.0
     """Min standard deviation of a measured torque, relative to its noise, that a model must explain."""
     level: float = 0.95
@@ -48,6 +52,8 @@ class HeldOutFigures:
     """Upper end of the confidence interval of the coverage."""
     independent: Array
     """Number of effective samples."""
+    interval_width: Array
+    """Mean width of the 95 % intervals, N·m."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +66,15 @@ class Acceptance:
     """Checks that the held-out samples are too few to decide."""
     speaks_for: tuple[str, ...] = ()
     """Reasons to accept the model."""
+    notes: tuple[str, ...] = ()
+    """Findings that decide nothing."""
 
     def __add__(self, other: Acceptance) -> Acceptance:
         return Acceptance(
-            self.against + other.against, self.unknown + other.unknown, self.speaks_for + other.speaks_for
+            self.against + other.against,
+            self.unknown + other.unknown,
+            self.speaks_for + other.speaks_for,
+            self.notes + other.notes,
         )
 
     @property
@@ -76,7 +87,7 @@ class Acceptance:
     @property
     def reason(self) -> str:
         """All sentences, the most severe first."""
-        return "; ".join(self.against + self.unknown + self.speaks_for)
+        return "; ".join(self.against + self.unknown + self.speaks_for + self.notes)
 
 
 def accept(figures: HeldOutFigures) -> Acceptance:
@@ -84,12 +95,12 @@ def accept(figures: HeldOutFigures) -> Acceptance:
 
     Example:
         >>> two = np.array([0.01, 0.98]), np.array([0.1, 1.0]), np.full(2, 0.05)
-        >>> many = np.array([0.95, 0.95]), np.array([0.97, 0.97]), np.full(2, 60.0)
+        >>> many = np.array([0.95, 0.95]), np.array([0.97, 0.97]), np.full(2, 60.0), np.full(2, 4.0)
         >>> accept(HeldOutFigures(("hip", "knee"), *two, *many)).against
         ('the error is not below that of the mean torque: knee at 0.98 of the variance (60 effective samples)',)
 
     """
-    return _check_error(figures) + _check_coverage(figures)
+    return _check_error(figures) + _check_coverage(figures) + _check_width(figures)
 
 
 def _check_error(figures: HeldOutFigures) -> Acceptance:
@@ -123,6 +134,14 @@ def _check_coverage(figures: HeldOutFigures) -> Acceptance:
     if narrow:
         return Acceptance(against=(texts.describe_coverage_against(OPTIONS.min_coverage, narrow),))
     return Acceptance(speaks_for=(texts.describe_coverage(OPTIONS.min_coverage),))
+
+
+def _check_width(figures: HeldOutFigures) -> Acceptance:
+    """Note joints with intervals that are wider than their errors need."""
+    need = 2 * quantile(metrics.LEVEL) * figures.rmse
+    ratio = np.divide(figures.interval_width, need, out=np.zeros_like(need), where=need > 0)
+    wide = _list_joints(figures.joint_names, [f"{each:.2g} times" for each in ratio], ratio > OPTIONS.max_width)
+    return Acceptance(notes=(texts.describe_width(wide),)) if wide else Acceptance()
 
 
 def _list_joints(names: Sequence[str], joints: Sequence[str], which: Mask) -> str:

@@ -135,6 +135,11 @@ def describe_coverage(least: float) -> str:
     return f"coverage of the 95 % intervals is at least {100 * least:.0f} % on every joint, within sampling error"
 
 
+def describe_width(joints: str) -> str:
+    """Return that intervals are wider than errors need. joints: with how many times."""
+    return f"the 95 % intervals are wider than the errors need: {joints}"
+
+
 def describe_joint_coverage(share: float, high: float, samples: float) -> str:
     """Return the coverage of one joint. high: upper end of its confidence interval; samples: effective ones."""
     return f"{100 * share:.0f} % (at most {100 * high:.0f} %, {samples:.0f} effective samples)"

@@ -17,6 +17,7 @@ GOOD_FIGURES = HeldOutFigures(
     coverage=np.array([0.95, 0.96]),
     coverage_high=np.array([0.97, 0.98]),
     independent=np.full(2, 60.0),
+    interval_width=np.array([0.5, 5.0]),
 )
 
 
@@ -66,6 +67,13 @@ def test_low_coverage_fails_unless_due_to_chance():
     assert "95 % intervals is below 90 %: knee at 70 % (at most 89 %, 60 effective samples)" in narrow.reason
 
 
+def test_wide_intervals_are_noted():
+    wide = accept_with(interval_width=[0.5, 12.0])
+    assert wide.passed is True
+    assert wide.reason.endswith("; the 95 % intervals are wider than the errors need: knee at 3.1 times")
+    assert accept_with(rmse=[0.0, 1.0], nmse=[0.0, 0.2]).notes == ()
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_mean_and_shuffled_torque_never_pass(seed):
     """Test a model that predicts the mean, with few effective samples, and one trained on shuffled torque."""
@@ -80,6 +88,6 @@ def test_mean_and_shuffled_torque_never_pass(seed):
             np.mean(error**2, axis=0) / torque.var(axis=0),
             np.sqrt(np.mean(error**2, axis=0)),
             noise_level([torque]),
-            *(np.full(3, value) for value in (1.0, 1.0, 20.0)),
+            *(np.full(3, value) for value in (1.0, 1.0, 20.0, 9.0)),
         )
         assert accept(figures).passed is not True

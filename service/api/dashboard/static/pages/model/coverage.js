@@ -2,17 +2,21 @@
 
 import { jointVar } from "../../colours.js";
 import { h } from "../../dom.js";
-import { count, percent, scientific, shortNames } from "../../format.js";
+import { count, number, percent, scientific, shortNames } from "../../format.js";
 import { badge, card } from "../../ui.js";
 
 const MIN_COVERAGE = 0.9, NOMINAL_COVERAGE = 0.95, MAX_COVERAGE = 0.99;
+/** Width of the 95 % interval of a normal error, in its standard deviations; largest width that is not called wide, in that of the errors. */
+const NORMAL_WIDTH = 3.92, MAX_WIDTH = 2;
 
-/** Return text and kind of a badge for the coverage of a joint. figures: {coverage, coverage_low, coverage_high}; imported ones may lack the bounds. */
+/** Return text and kind of a badge for the coverage of a joint. figures: {coverage, coverage_low, coverage_high, rmse, interval_width}; imported ones may lack all but the first, lists the last two. */
 export function coverageVerdict(figures, joint) {
   const share = figures.coverage[joint];
   const [low, high] = [figures.coverage_low?.[joint] ?? share, figures.coverage_high?.[joint] ?? share];
   if (high < MIN_COVERAGE) return ["intervals too narrow", "bad"];
   if (share < MIN_COVERAGE) return ["too few samples", "warn"];
+  const width = figures.interval_width?.[joint] / (NORMAL_WIDTH * figures.rmse?.[joint]);
+  if (width > MAX_WIDTH) return [`intervals ${number(width, 2)} × as wide as needed`, "plain"];
   return share > MAX_COVERAGE && low > 0.95 ? ["intervals too wide", "plain"] : ["good", "good"];
 }
 
