@@ -43,7 +43,7 @@ TORCH_ESTIMATORS = ("se", "gip", "lse")
 """Estimators that torch differentiates in training, on a GPU if there is one. They need the extra `train`; their
 predictions do not."""
 
-DriveKind = Literal["stribeck", "speed", "sides", "load", "gain", "play"]
+DriveKind = Literal["stribeck", "speed", "sides", "position", "load", "gain", "play"]
 DRIVE_KINDS: tuple[DriveKind, ...] = get_args(DriveKind)
 """Kinds of friction beyond viscous, Coulomb and offset (`lipcore.kernels.drive.terms`)."""
 

@@ -34,6 +34,7 @@ from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, PlayState, element_w
 from lipcore.kernels.drive.terms import SHAPE_SPEEDS, SIGN_WIDTH, STRIBECK_SPEED
 from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
+from lipcore.kernels.fast.drive import HARMONICS
 from lipcore.kernels.fast.play import CERTAIN_SHARE
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
@@ -118,6 +119,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "n": str(n),
         "friction": str(rubbing.shape[1]),
         **{kind: str(int(kind in learnt.friction.drive.kinds)) for kind in DRIVE_KINDS},
+        "harmonics": str(HARMONICS),
         "bodies": str(sum(counts)),
         "steps": str(arm.steps),
         "others": str(others),

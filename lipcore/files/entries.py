@@ -54,7 +54,9 @@ class Friction(Entry):
     coulomb: Estimate
     offset: Estimate
     stribeck: Estimate | UnsetType = UNSET
+    position: Estimate | UnsetType = UNSET
     load: Estimate | UnsetType = UNSET
+    gain: Estimate | UnsetType = UNSET
     breakaway: Estimate | UnsetType = UNSET
     stiffness: Estimate | UnsetType = UNSET
 

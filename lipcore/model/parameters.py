@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.drive.kernel import DriveKernel
-from lipcore.kernels.drive.terms import passing_row, summary_rows
+from lipcore.kernels.drive.terms import KIND_TERMS, passing_row, summary_rows
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.plausible import is_plausible, nearest_plausible
 from lipcore.posterior.compact import CompactPosterior
@@ -58,6 +58,9 @@ class Friction:
     stribeck: Array | None = None
     """Additional friction at low speed, N·m (N); None if the model does not have it."""
     stribeck_std: Array | None = None
+    position: Array | None = None
+    """Torque that repeats over a turn, root mean square, N·m (N); None if the model does not have it."""
+    position_std: Array | None = None
     load: Array | None = None
     """Friction per torque that the bodies need; None if the model does not have it."""
     load_std: Array | None = None
@@ -128,6 +131,12 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
     for name, row in rows.items():
         named[name] = np.einsum("nf,nf->n", mean, row)
         named[f"{name}_std"] = np.sqrt(np.maximum(np.einsum("nf,nfg,ng->n", row, covariance, row), 0.0))
+    if "position" in term.drive.kinds:
+        waves = [term.drive.terms.index(each) for each in KIND_TERMS["position"]]
+        size = np.sqrt(0.5 * np.square(mean[:, waves]).sum(axis=1))
+        slope = 0.5 * mean[:, waves] / np.maximum(size, 1e-300)[:, None]
+        named["position"] = size
+        named["position_std"] = np.sqrt(np.einsum("nf,nfg,ng->n", slope, covariance[:, waves][:, :, waves], slope))
     return Friction(**named)
 
 
@@ -196,7 +205,7 @@ def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Seque
     out: dict[str, Any] = {
         "friction": {
             name: {"mean": getattr(friction, name).tolist(), "std": getattr(friction, f"{name}_std").tolist()}
-            for name in ("viscous", "coulomb", "offset", "stribeck", "load", "gain", "breakaway", "stiffness")
+            for name in (each.name for each in fields(friction) if not each.name.endswith("_std"))
             if getattr(friction, name) is not None
         }
     }

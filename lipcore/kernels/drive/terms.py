@@ -1,6 +1,7 @@
 """The terms of a joint's drive, friction and gain, one coefficient each.
 
-With the velocity v, its smoothed sign s = tanh(v / w), and the torque τ that the bodies need at this joint:
+With the position q, the velocity v, its smoothed sign s = tanh(v / w), and the torque τ that the bodies need at this
+joint:
 
     viscous   v
     coulomb   s
@@ -8,6 +9,7 @@ With the velocity v, its smoothed sign s = tanh(v / w), and the torque τ that t
     stribeck  s exp(−(v / 0.1)²)                                             friction falls with speed
     speed     tanh(v / 0.1), tanh(v / 0.4), tanh(v / 1.5), v |v|             it is not linear in speed
     sides     |s|, |v|                                                       it differs between the directions
+    position  sin q, cos q, sin 2q, … cos 4q                                 it repeats over a turn
     load      |τ| s, |τ| v                                                   it grows with the torque carried
     gain      τ                                                              torque reads too high or too low
     play      e₁ … e_K                                                       it remembers where the joint came from
@@ -25,6 +27,7 @@ import numpy as np
 
 from lipcore.data.motion import Array
 from lipcore.kernels.drive.play import ELEMENTS
+from lipcore.kernels.fast.drive import HARMONICS
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 
 SIGN_WIDTH = 0.02
@@ -38,10 +41,13 @@ SUMMARY_SPEEDS = (0.1, 1.0)
 MAX_GAIN_STD = 0.1
 """Max prior standard deviation of a gain: that of nominal torque constants. Torque sensors are better."""
 BASE_TERMS = ("viscous", "coulomb", "offset")
+WAVES = range(1, HARMONICS + 1)
+"""Periods a turn of torque that repeats over a turn, as of cables, torque sensors and gears."""
 KIND_TERMS: dict[DriveKind, tuple[str, ...]] = {
     "stribeck": ("stribeck",),
     "speed": ("speed_slow", "speed_medium", "speed_fast", "speed_square"),
     "sides": ("side", "side_viscous"),
+    "position": tuple(f"{each}_{number}" for number in WAVES for each in ("sin", "cos")),
     "load": ("load", "load_viscous"),
     "gain": ("gain",),
     "play": tuple(f"play_{number}" for number in range(1, len(ELEMENTS) + 1)),
@@ -63,13 +69,16 @@ def drive_terms(kinds: Sequence[DriveKind] = ()) -> tuple[str, ...]:
 
 
 def drive_features(
-    dq: Array, kinds: Sequence[DriveKind] = (), load: Array | None = None, deflections: Array | None = None
+    dq: Array,
+    kinds: Sequence[DriveKind] = (),
+    q: Array | None = None,
+    load: Array | None = None,
+    deflections: Array | None = None,
 ) -> Array:
     """Return the terms of N velocities, (f, N, n).
 
-    dq: (N, n) rad/s (m/s); load: (N, n) N·m (N), the torque that the bodies need, for the kinds `load`
-    and `gain`;
-    deflections: (N, K, n), expected ones, for the kind `play`.
+    dq: (N, n) rad/s (m/s); q: (N, n) rad (m), for the kind `position`; load: (N, n) N·m (N), the torque that the bodies
+    need, for the kinds `load` and `gain`; deflections: (N, K, n), expected ones, for the kind `play`.
     """
     sign, speed = np.tanh(dq / SIGN_WIDTH), np.abs(dq)
     parts = [dq, sign, np.ones_like(dq)]
@@ -79,6 +88,9 @@ def drive_features(
         parts += [*(np.tanh(dq / each) for each in SHAPE_SPEEDS), dq * speed]
     if "sides" in kinds:
         parts += [np.abs(sign), speed]
+    if "position" in kinds:
+        assert q is not None  # the caller has it
+        parts += [turn(number * q) for number in WAVES for turn in (np.sin, np.cos)]
     if "load" in kinds:
         assert load is not None  # the caller computes it
         parts += [np.abs(load) * sign, np.abs(load) * dq]
@@ -114,10 +126,11 @@ def summary_rows(kinds: Sequence[DriveKind]) -> dict[str, Array]:
     if not {"speed", "sides"} & set(kinds):
         return {**rows, "coulomb": rows["coulomb"] + slipped}
     low, high = SUMMARY_SPEEDS
-    counted = np.array([term not in ("stribeck", *KIND_TERMS["load"], "gain") for term in terms])
-    speeds, still = np.array([[low], [high]]), np.zeros((2, len(ELEMENTS), 1))
+    left_out = ("stribeck", *KIND_TERMS["position"], *KIND_TERMS["load"], "gain")
+    counted = np.array([term not in left_out for term in terms])
+    speeds, still, zero = np.array([[low], [high]]), np.zeros((2, len(ELEMENTS), 1)), np.zeros((2, 1))
     ahead, back = (
-        drive_features(each, kinds, np.zeros_like(each), still + np.sign(each[0]))[:, :, 0] * counted[:, None]
+        drive_features(each, kinds, zero, zero, still + np.sign(each[0]))[:, :, 0] * counted[:, None]
         for each in (speeds, -speeds)
     )
     odd = 0.5 * (ahead - back)

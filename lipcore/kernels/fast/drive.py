@@ -2,7 +2,7 @@
 
 Common arguments:
 
-- kinds: (6,), one for each of `DRIVE_KINDS`: 1 if the drive has it, else 0;
+- kinds: (7,), one for each of `DRIVE_KINDS`: 1 if the drive has it, else 0;
 - memory: `Memory` of the arm's constants, gravity and parameters, with `drive_size` elements to work in; without the
   kinds `load` and `gain`, only n elements;
 - order: (n,), the data's joint at each place of the chain;
@@ -27,8 +27,11 @@ from lipcore.kernels.fast.compile import brief, compiled, inlined
 from lipcore.kernels.fast.play import expected_deflection
 from lipcore.kernels.fast.views import numbers
 
-STRIBECK, SPEED, SIDES, LOAD, GAIN, PLAY = range(6)
+STRIBECK, SPEED, SIDES, POSITION, LOAD, GAIN, PLAY = range(7)
 """Places of the kinds."""
+HARMONICS = 4
+"""Max periods a turn of the kind `position`. On the residuals of five recordings, 5 to 32 periods predicted no held-out
+eighth of a joint better."""
 
 
 def drive_size(n: int) -> int:
@@ -70,6 +73,14 @@ def _write_terms(
         out[row, column] = abs(sign)
         out[row + 1, column] = speed
         row += 2
+    if kinds[POSITION]:
+        sine, cosine = np.sin(motion[0, joint]), np.cos(motion[0, joint])
+        out[row, column], out[row + 1, column] = sine, cosine
+        for k in range(2, 2 * HARMONICS, 2):  # sin (k + 1) q and cos (k + 1) q from those of k q and q
+            before, other = out[row + k - 2, column], out[row + k - 1, column]
+            out[row + k, column] = before * cosine + other * sine
+            out[row + k + 1, column] = other * cosine - before * sine
+        row += 2 * HARMONICS
     if kinds[LOAD]:
         out[row, column] = abs(load) * sign
         out[row + 1, column] = abs(load) * velocity

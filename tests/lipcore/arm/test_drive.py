@@ -38,7 +38,8 @@ MAXWELL = Dirt(load=0.5, position=0.0, warmth=0.0, ripple=0.0, gain=0.0, noise=0
 
 def simulate_friction(seed: int, kind: str = "none") -> Samples:
     """Simulate an arm with Coulomb friction of 0.4 N·m and one kind of friction beyond it; the noise is 0.02 N·m."""
-    samples = simulate(ROBOT, Simulation(400, n_sinusoids=30, speed=6.0, noise=0.02, viscous=0.3), seed)
+    motion = "full" if kind == "position" else "middle"
+    samples = simulate(ROBOT, Simulation(400, n_sinusoids=30, speed=6.0, noise=0.02, viscous=0.3, motion=motion), seed)
     sign, speed = np.tanh(samples.dq / 0.02), np.abs(samples.dq)
     load = np.abs(inverse_dynamics(ROBOT, samples.q, samples.dq, samples.ddq))
     more = {
@@ -47,6 +48,7 @@ def simulate_friction(seed: int, kind: str = "none") -> Samples:
         "falling load": -SHARE * load * sign,
         "speed": 0.4 * np.tanh(samples.dq / 0.4) - 0.2 * samples.dq * speed,
         "sides": 0.3 * np.abs(sign) - 0.1 * speed,
+        "position": 0.5 * np.sin(2 * samples.q) - 0.3 * np.cos(3 * samples.q),
         "gain": GAINS * inverse_dynamics(ROBOT, samples.q, samples.dq, samples.ddq),
     }[kind]
     return replace(samples, tau=samples.tau + 0.4 * sign + more)
@@ -75,7 +77,7 @@ def pose(samples: Samples) -> tuple[Problem, Point]:
     return problem, problem.with_noise(problem.at(GEOMETRY.canonical(), 0.05 * samples.tau.std(axis=0)))
 
 
-@pytest.mark.parametrize("kind", ["load", "gain", slow("speed"), slow("sides")])
+@pytest.mark.parametrize("kind", ["load", "gain", "position", slow("speed"), slow("sides")])
 def test_supported_kind_is_chosen_and_predicts_better(kind: DriveKind, monkeypatch: pytest.MonkeyPatch) -> None:
     model, unseen = train_friction(kind), simulate_friction(2, kind)
     assert kind in str(model.fit["drive"])
@@ -96,6 +98,22 @@ def test_share_of_the_load_is_recovered() -> None:
     assert (np.abs(friction.load - SHARE) < 3 * friction.load_std).all()
     assert (friction.load_std < 0.3 * SHARE).any()
     assert (np.abs(friction.coulomb - 0.4) < 3 * friction.coulomb_std).all()
+
+
+def test_torque_that_repeats_over_a_turn_is_recovered() -> None:
+    model = train_friction("position")
+    friction = friction_coefficients(model.posterior, model.estimator)
+    assert friction.position is not None
+    assert friction.position_std is not None
+    truth = np.sqrt(0.5 * (0.5**2 + 0.3**2))
+    np.testing.assert_allclose(friction.position, truth, rtol=0.03)
+    assert (friction.position_std < 0.03 * truth).all()
+
+
+def test_joints_that_turn_little_have_no_torque_that_repeats_over_a_turn() -> None:
+    samples = simulate_friction(1, "position")
+    problem, point = pose(replace(samples, q=np.clip(samples.q, -1.5, 1.5)))
+    assert "position" not in choose_drive(problem, point, np.arange(400), lambda: False).problem.drive.kinds
 
 
 def test_gains_are_recovered_and_belong_to_the_bodies() -> None:
@@ -235,7 +253,7 @@ def test_report_of_curved_friction_is_a_line_through_its_curve() -> None:
 
 def test_unknown_kinds_and_a_load_without_arm_are_rejected() -> None:
     with pytest.raises(
-        ValueError, match="drive kind is 'cogging', expected one of stribeck, speed, sides, load, gain, play"
+        ValueError, match="drive kind is 'cogging', expected one of stribeck, speed, sides, position, load"
     ):
         Drive(3, ("cogging",))
     with pytest.raises(ValueError, match="'load' needs bodies"):
@@ -276,7 +294,7 @@ def test_model_with_play_is_stored_and_restored(tmp_path: Path) -> None:
         ("arm/acceleration", np.ones(2), "'arm/acceleration' is wrong"),
         ("arm/acceleration", np.array([1.0, 0.0, 1.0]), "'arm/acceleration' is wrong"),
         ("arm/acceleration", np.array([1.0, np.nan, 1.0]), "'arm/acceleration' is not made of finite"),
-        ("arm/drive", np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), "'arm/acceleration' is wrong"),
+        ("arm/drive", np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), "'arm/acceleration' is wrong"),
         ("misfit", np.ones((15, 3)), r"'misfit' has shape \(15, 3\), expected \(16, 3\)"),
         ("misfit", np.ones((16, 2)), r"'misfit' has shape \(16, 2\), expected \(16, 3\)"),
         ("misfit", -np.ones((16, 3)), "'misfit' has a number below zero"),

@@ -40,7 +40,7 @@ GEOMETRY_STEP = 1e-4
 GEOMETRY_TOLERANCE = 1e-9
 """Relative tolerance for derivatives by the geometry."""
 
-KINDS_OF_ARM: tuple[DriveKind, ...] = ("stribeck", "load", "gain", "play")
+KINDS_OF_ARM: tuple[DriveKind, ...] = ("stribeck", "position", "load", "gain", "play")
 
 Features = Callable[[Motion], Array]
 
@@ -90,7 +90,7 @@ def drive_terms_of(arm: Arm, kinds: Sequence[DriveKind], motion: Motion) -> Arra
     """Return the terms of friction with the torque of an arm's bodies as the load, (f, N, n)."""
     load = bodies_torque(arm.geometry, arm.order, arm.parameters, motion)
     known = deflections_of(motion, element_widths(arm.joint_types), arm.acceleration)
-    return drive_features(motion.dq, kinds, load, known[:, : len(ELEMENTS)])
+    return drive_features(motion.dq, kinds, motion.q, load, known[:, : len(ELEMENTS)])
 
 
 def mixture_features(kernel: MixtureKernel, arm: Arm, motion: Motion) -> Array:

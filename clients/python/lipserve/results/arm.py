@@ -21,6 +21,7 @@ FRICTION = {
     "coulomb": "Coulomb N·m",
     "offset": "offset N·m",
     "stribeck": "at low speed N·m",
+    "position": "varying over a turn N·m",
     "load": "share of the load",
     "gain": "gain error",
     "breakaway": "breakaway N·m",
@@ -67,8 +68,8 @@ class Arm(Plain):
     deviation: Array
     """(n,) RMS difference between the torque of these bodies and that of the estimate, N·m (prismatic: N)."""
     friction: Mapping[str, tuple[Array, Array]]
-    """Means and standard deviations, (n,) each, of `viscous`, `coulomb` and `offset`; `stribeck`, `load`, `gain`,
-    `breakaway` and `stiffness` if estimated."""
+    """Means and standard deviations, (n,) each, of `viscous`, `coulomb` and `offset`; `stribeck`, `position`,
+    `load`, `gain`, `breakaway` and `stiffness` if estimated."""
     undetermined: tuple[tuple[str, ...], ...]
     """Per joint, parameters that are unidentifiable from torque."""
 

@@ -40,6 +40,7 @@ export function massTable({ joint_names: names, joint_types: types, parameters }
     { label: "Viscous, N·m·s", numeric: true, cell: (joint) => pair(friction.viscous, joint) },
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },
     ...(friction.stribeck ? [{ label: "Stribeck, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
+    ...(friction.position ? [{ label: "Varying over a turn, N·m", numeric: true, cell: (joint) => pair(friction.position, joint) }] : []),
     ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: (joint) => pair(friction.load, joint) }] : []),
     ...(friction.gain ? [{ label: "Gain error", numeric: true, cell: (joint) => pair(friction.gain, joint) }] : []),
     ...(friction.breakaway ? [{ label: "Breakaway, N·m", numeric: true, cell: (joint) => pair(friction.breakaway, joint) }] : []),

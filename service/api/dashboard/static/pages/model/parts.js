@@ -63,6 +63,7 @@ function frictionCard({ joint_names: names, joint_types: types, parameters }) {
     { label: "Coulomb, N·m", numeric: true, cell: value("coulomb") },
     { label: "Offset, N·m", numeric: true, cell: value("offset") },
     ...(friction.stribeck ? [{ label: "Stribeck, N·m", numeric: true, cell: value("stribeck") }] : []),
+    ...(friction.position ? [{ label: "Varying over a turn, N·m", numeric: true, cell: value("position") }] : []),
     ...(friction.load ? [{ label: "Share of the load", numeric: true, cell: value("load") }] : []),
     ...(friction.gain ? [{ label: "Gain error", numeric: true, cell: value("gain") }] : []),
     ...(friction.breakaway ? [{ label: "Breakaway, N·m", numeric: true, cell: value("breakaway") }] : []),
