@@ -20,8 +20,12 @@ Knowledge = Literal["nothing", "URDF"]
 """What a method knows of the robot besides the samples and the joint types."""
 PRODUCT = "LIPServe"
 """Method: the service with default options."""
+BASE_FRICTION = "LIPServe, base friction"
+"""Method: the same, with no more than viscous and Coulomb friction and an offset; computed without the service."""
+OWN = PRODUCT, BASE_FRICTION
+"""Methods of LIPServe."""
 SOURCES = ("lipcore", "service", "clients/python/lipserve")
-"""Folders of code on which results of PRODUCT depend."""
+"""Folders of code on which results of OWN depend."""
 
 
 class Cell(BaseModel):
@@ -105,14 +109,14 @@ def evaluate_forecast(cell: Cell, split: Split, forecast: Forecast, seconds: flo
 
 
 class Cache:
-    """Results in a folder; results of PRODUCT belong to a revision, others are kept until they are deleted."""
+    """Results in a folder; results of OWN belong to a revision, others are kept until they are deleted."""
 
     def __init__(self, folder: Path, revision: str) -> None:
         self.folder, self.revision = folder, revision
 
     def add(self, result: Result) -> None:
         """Store a result atomically."""
-        if result.cell.method == PRODUCT:
+        if result.cell.method in OWN:
             result = result.model_copy(update={"revision": self.revision})
         path = self._path(result.cell)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -126,7 +130,7 @@ class Cache:
         return Result.model_validate_json(path.read_bytes()) if path.is_file() else None
 
     def _path(self, cell: Cell) -> Path:
-        revision = f"@{self.revision}" if cell.method == PRODUCT else ""
+        revision = f"@{self.revision}" if cell.method in OWN else ""
         return (
             self.folder
             / cell.recording

@@ -71,14 +71,19 @@ class Bed:
         return Trained(model, job.version, version.estimator, spent.total_seconds())
 
     def predict(self, trained: Trained, samples: Samples) -> Forecast:
-        """Predict the torque of each row, and the standard deviation equivalent to the 95 % interval."""
+        """Predict the torque along the motion, and the standard deviation equivalent to the 95 % interval."""
         means, halves = [], []
-        for start in range(0, len(samples), BATCH_ROWS):
-            rows = samples.rows(slice(start, start + BATCH_ROWS))
-            answer = self.client.predict(trained.model, rows.q, rows.dq, rows.ddq, version=trained.version)
-            low, high = answer.interval(LEVEL)
-            means.append(answer.tau)
-            halves.append((high - low) / 2)
+        for part in samples.episodes():
+            episode, history = samples.rows(part), None
+            for start in range(0, len(episode), BATCH_ROWS):
+                rows = episode.rows(slice(start, start + BATCH_ROWS))
+                answer = self.client.predict(
+                    trained.model, rows.q, rows.dq, rows.ddq, version=trained.version, t=rows.t, history=history
+                )
+                history = rows.t, rows.q, rows.dq
+                low, high = answer.interval(LEVEL)
+                means.append(answer.tau)
+                halves.append((high - low) / 2)
         return Forecast(np.concatenate(means), np.concatenate(halves) / quantile(LEVEL))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.latency import table
 from benchmarks.latency.table import NOTHING, Grid
 from benchmarks.latency.targets import Target
-from benchmarks.real.cells import PRODUCT, Knowledge, Result
+from benchmarks.real.cells import OWN, PRODUCT, Knowledge, Result
 from benchmarks.real.running import ALONE, WITH_BODY, Outcome
 from benchmarks.real.splits import EARLY, GUARD_S, MAX_TEST_ROWS
 
@@ -35,7 +35,7 @@ Split = tuple[str, str]
 """Names of recording and split."""
 Column = tuple[str, Knowledge]
 COLUMNS: Sequence[Column] = (
-    *((PRODUCT, "nothing"), (PRODUCT, "URDF")),
+    *((method, knowledge) for method in OWN for knowledge in EITHER),
     *((method, "nothing") for method in ALONE),
     *((method, "URDF") for method in WITH_BODY),
 )
@@ -59,7 +59,7 @@ class Summary:
     def ratio(self, result: Result, knowledge: tuple[Knowledge, ...] = EITHER) -> float | None:
         """Return the error / error of the best other method with this knowledge; None without any."""
         row = self.rows[result.cell.recording, result.cell.split]
-        rivals = [each.error for (method, known), each in row.items() if method != PRODUCT and known in knowledge]
+        rivals = [each.error for (method, known), each in row.items() if method not in OWN and known in knowledge]
         return result.error / min(rivals) if rivals else None
 
 
@@ -117,9 +117,7 @@ def errors(summary: Summary) -> Grid:
         cells = (row.get(column) for column in COLUMNS)
         figures = (NOTHING if each is None else _power(each.error) for each in cells)
         rows.append((f"{recording}, {split}", f"{learnt:.1f}", *figures))
-    heads = (
-        f"{method}, {KNOWLEDGE_TITLES[knowledge]}" if method == PRODUCT else method for method, knowledge in COLUMNS
-    )
+    heads = (f"{method}, {KNOWLEDGE_TITLES[knowledge]}" if method in OWN else method for method, knowledge in COLUMNS)
     title = "nMSE, mean over the joints; least squares and the methods after it know the URDF"
     return Grid(title, ("recording, test", "training s", *heads), rows)
 

@@ -16,13 +16,17 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.real import mujoco_sysid, rivals
-from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, evaluate_forecast
+from benchmarks.real.cells import BASE_FRICTION, PRODUCT, Cache, Cell, Result, evaluate_forecast
 from benchmarks.real.product import Bed, open_bed
 from benchmarks.real.recordings import RECORDINGS, Recording, prepare
 from benchmarks.real.rivals import Forecast, Predict
 from benchmarks.real.splits import Split, splits
+from lipcore.arm import drive
+from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.samples import Samples
 from lipcore.robots.urdf import RigidBody
+from lipcore.training.train import train
+from lipcore.vocabulary import AUTO, JointType
 
 ALONE: Mapping[str, Predict] = {"mean": rivals.predict_mean, "RBF ridge": rivals.predict_rbf}
 """Other methods without knowledge of the robot."""
@@ -108,10 +112,10 @@ def make_plan(options: Options, service: Service) -> Plan:
 
 
 def _cells(recording: Recording, split: str) -> Iterator[Cell]:
-    for method in (PRODUCT, *ALONE):
+    for method in (PRODUCT, BASE_FRICTION, *ALONE):
         yield Cell(recording=recording.name, split=split, knowledge="nothing", method=method)
     if recording.robot is not None:
-        for method in (PRODUCT, *WITH_BODY):
+        for method in (PRODUCT, BASE_FRICTION, *WITH_BODY):
             yield Cell(recording=recording.name, split=split, knowledge="URDF", method=method)
 
 
@@ -124,10 +128,26 @@ def compute_cell(cell: Cell, recording: Recording, split: Split, service: Servic
         trained = bed.train(f"{cell.recording}-{cell.split}-{cell.knowledge}".lower(), split.train, types, robot)
         return evaluate_forecast(cell, split, bed.predict(trained, states), trained.seconds, trained.estimator)
     known = cell.knowledge == "URDF"
+    if cell.method == BASE_FRICTION:
+        body = recording.body(split.train) if known else None
+        return predict_with_base_friction(cell, split, states, recording.joint_types(split.train.n_joints), body)
     predict = partial(WITH_BODY[cell.method], recording.body(split.train)) if known else ALONE[cell.method]
     began = time.monotonic()
     forecast = predict(split.train, states)
     return evaluate_forecast(cell, split, forecast, time.monotonic() - began)
+
+
+def predict_with_base_friction(
+    cell: Cell, split: Split, states: Samples, joint_types: Sequence[JointType], body: RigidBody | None
+) -> Result:
+    """Train without kinds of friction that a recording has to support, and predict the states of a split's test."""
+    began = time.monotonic()
+    drive.OPTIONS = replace(drive.OPTIONS, kinds=())  # the service trains in another process
+    model = train(split.train, joint_types, AUTO, robot=body)
+    seconds = time.monotonic() - began
+    answer = model.predict_along(states).interval
+    forecast = Forecast(answer.mean, answer.half_width / quantile(LEVEL))
+    return evaluate_forecast(cell, split, forecast, seconds, model.estimator.name)
 
 
 def _compute_all(

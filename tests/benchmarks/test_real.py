@@ -221,7 +221,7 @@ def test_page_contains_every_table():
     results = [toy("a", method=PRODUCT, error=0.3, estimator="rigid-body"), toy("a", error=1.5)]
     page = report.page(running.Outcome(results, {"a/first-30s": "9.0 s recorded"}, {}, ["mujoco.sysid"]), "aaaa")
     parts = (
-        "| a, other | 20.0 | 3.0e-1 | – | 1.5 |",
+        "| a, other | 20.0 | 3.0e-1 | – | – | – | 1.5 |",
         "| a, other, no URDF | 3.0e-1 3.0e-1 | 95 95 | 1.0 | 0.3 | 0.20 | 0.20 | 1 | rigid-body |",
         "| LIPServe, no URDF | 100 | 1.0 | 1.0 | 1.0 | 1 of 1 |",
         "a/first-30s (9.0 s recorded)",
