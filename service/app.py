@@ -41,10 +41,10 @@ from service.api.routes import (
 from service.api.stream import routes as stream
 from service.foundation.settings import Settings
 from service.foundation.text import counted
+from service.learning import friction, refresh
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.metrics import LearningCollector
-from service.learning.refresh import attach
 from service.models import deletion, registry
 from service.models.loaded import LoadedModels
 from service.replication import Replication
@@ -196,7 +196,8 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     learners = Learners(loaded)
     learners.weighing.expect()
-    attach(learners, jobs)
+    refresh.attach(learners, jobs)
+    friction.attach(learners)
     return storage, jobs, learners
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from lipcore.robots.urdf import PARAMETERS
 
 STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
 """Names of a joint's numbers of geometry: turns about, and shifts along, the two vectors across its axis."""
+FrictionName = Literal["viscous", "coulomb", "load"]
+"""Names of the coefficients of `Friction` that cannot be negative."""
 UNIDENTIFIABLE_SHARE = 0.5
 """A parameter is unidentifiable if its standard deviation is above this share of the prior one."""
 
@@ -73,6 +75,21 @@ class Friction:
     stiffness: Array | None = None
     """Stiffness of a joint that has turned back, before it slips, N·m/rad (N/m); None likewise."""
     stiffness_std: Array | None = None
+
+
+@dataclass(frozen=True)
+class NegativeFriction:
+    """A coefficient of friction that is negative, which no joint has."""
+
+    joint: int
+    """Place of the joint in the order of the data."""
+    name: FrictionName
+    mean: float
+    std: float
+
+    def is_implausible(self, deviations: float) -> bool:
+        """Return whether it lies more than so many standard deviations below zero."""
+        return self.mean < -deviations * self.std
 
 
 @dataclass(frozen=True)
@@ -138,6 +155,24 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
         named["position"] = size
         named["position_std"] = np.sqrt(np.einsum("nf,nfg,ng->n", slope, covariance[:, waves][:, :, waves], slope))
     return Friction(**named)
+
+
+def negative_friction(posterior: Posterior, estimator: Estimator) -> tuple[NegativeFriction, ...]:
+    """Return the coefficients of friction that are negative; none for an estimator without friction.
+
+    Viscous friction may be negative if friction is not linear in speed, because it is then the slope of a line.
+    """
+    if not isinstance(estimator.terms.get("friction"), DriveKernel):
+        return ()
+    friction, kinds = friction_coefficients(posterior, estimator), _drive_kernel(estimator).drive.kinds
+    names: tuple[FrictionName, ...] = ("coulomb", "load") if "speed" in kinds else ("viscous", "coulomb", "load")
+    return tuple(
+        NegativeFriction(joint, name, float(mean), float(std))
+        for name in names
+        if (means := getattr(friction, name)) is not None
+        for joint, (mean, std) in enumerate(zip(means, getattr(friction, f"{name}_std"), strict=True))
+        if mean < 0
+    )
 
 
 def passing_friction(posterior: Posterior, estimator: Estimator) -> Array:

@@ -17,7 +17,7 @@ REPLAYABLE = tuple(code for code in CODES if code not in ("learnt", "non_finite"
 """Codes of complete rows, which can still be learnt."""
 Nullable = list[float | None]
 
-AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
+AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock", "friction"]
 
 
 class Figures(BaseModel):

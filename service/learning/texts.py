@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from lipcore.model.parameters import FrictionName
+from lipcore.model.texts import list_joints
 from service.foundation.text import percent
 
 CONSEQUENCES = {
@@ -49,6 +53,25 @@ def describe_payload(stream_id: str, mean: float, std: float) -> str:
 def describe_put_down(stream_id: str) -> str:
     """Return the alarm that a payload was put down."""
     return f"Stream {stream_id} has put down its payload."
+
+
+def describe_coefficient(joint: str, name: FrictionName, mean: float, std: float, unit: str) -> str:
+    """Return a coefficient of friction of a joint, as `describe_friction` lists it."""
+    what = {"viscous": "viscous", "coulomb": "Coulomb", "load": "share of the load"}[name]
+    return f"{joint} ({what} {mean:.2g} ± {std:.1g}{unit})".replace("-", "−")
+
+
+def describe_friction(coefficients: Sequence[str]) -> str:
+    """Return the alarm of friction that is learnt with the wrong sign. coefficients: see `describe_coefficient`."""
+    return (
+        f"Learnt friction is negative: {list_joints(coefficients)}. "
+        "Check the torque of these joints, its sign, and the payloads of the streams."
+    )
+
+
+def describe_plausible_friction() -> str:
+    """Return the alarm that no learnt friction is negative any more."""
+    return "Learnt friction is plausible again."
 
 
 def describe_novelty(version: str, share: float, rows: int) -> str:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sqlalchemy.exc import DBAPIError
 
 from lipcore.data.samples import Array
+from lipcore.model.parameters import NegativeFriction, negative_friction
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import linearisation_error
 from lipcore.online import transfer as state
@@ -78,6 +79,7 @@ class Follower:
         self._solved: tuple[OnlineModel, Array] | None = None
         self._revision: Revision | None = None
         self._linearisation: tuple[float, ...] | None = None
+        self._friction: tuple[NegativeFriction, ...] = ()
         self._published = self.start
         self._stored, self._stored_at = self.known.number, time.monotonic()
         self._snapshot: str | None = None
@@ -120,6 +122,7 @@ class Follower:
             seconds=self._seconds + ended - began,
             at=time.time(),
             linearisation=self._linearisation,
+            negative_friction=self._friction,
         )
         self._published, self._seconds = self.number, 0.0
         # at most half of the time is for solving
@@ -192,4 +195,5 @@ class Follower:
             error = linearisation_error(answering)
             # a joint with errors no larger than stated needs no refresh
             self._linearisation = None if error is None else tuple(np.where(floor > 0, error, 0.0).tolist())
+            self._friction = negative_friction(answering.posterior, answering.estimator)
         return self._revision

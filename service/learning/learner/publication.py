@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lipcore.model.parameters import NegativeFriction
 from lipcore.online.transfer import Revision
 from service.storage.files import Files, new_id
 
@@ -42,6 +43,8 @@ class Publication:
     """Unix time, s."""
     linearisation: tuple[float, ...] | None = None
     """Error of each joint from linearising a learnt arm, in units of the stated error; None without such an arm."""
+    negative_friction: tuple[NegativeFriction, ...] = ()
+    """Coefficients of friction that are negative, however uncertain."""
 
 
 @dataclass(frozen=True)

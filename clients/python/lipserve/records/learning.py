@@ -199,7 +199,7 @@ class Alarm(Record, frozen=True, kw_only=True):
     """An alarm of a learning model for its owner."""
 
     id: int
-    kind: Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
+    kind: Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock", "friction"]
     at: str
     message: str
     evidence: dict[str, Any]
