@@ -39,6 +39,8 @@ class Estimate:
     """Draws from the posterior, if that is not linear."""
     doubt: float = 1.0
     """Factor of its standard deviations over those of the linear posterior."""
+    misfit: float = 1.0
+    """Mean square of the whitened errors of the rows."""
 
     @property
     def mass(self) -> tuple[float, float]:

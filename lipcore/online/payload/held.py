@@ -25,6 +25,8 @@ class TrackedPayloadOptions:
     max_rows: int = 100
     """Max rows with the payload, evenly spread over the time since."""
     max_rows_before: int = 10
+    max_misfit: float = 3.0
+    """Mean square of the whitened errors beyond which rows before the payload may contradict it."""
     growth: float = 1.45
     """The payload is estimated, or refined, again once its rows have grown by this factor."""
     growth_anew: float = 2.0
@@ -71,6 +73,10 @@ class TrackedPayload:
         """Return the payload that rows show. before: rows without it."""
         before = before.take(slice(None, None, max(1, -(-len(before) // OPTIONS.max_rows_before))))
         first, count = estimate(carrier, rows, before), len(rows)
+        if len(before) and first.misfit > OPTIONS.max_misfit:  # it may have been picked up earlier
+            alone = estimate(carrier, rows)
+            if alone.misfit < 0.5 * first.misfit:
+                first, before = alone, no_rows(carrier.model.n_joints)
         return TrackedPayload(
             float(rows.time[0]), False, rows, before, 1, count, OPTIONS.growth * count, ANY_PAYLOAD, first
         )

@@ -204,8 +204,9 @@ class PayloadTracker:
     def _pick_up(self, carrier: Carrier, after: int, every: int = 1) -> PayloadTracker:
         """Return the tracker with the payload that the last `after` cells show; one of `every` cells was compared."""
         rows, before = Rows.concatenate(self.recent[-after:]), no_rows(self.n)
-        if self.held is None and len(self.recent) > after:  # rows before must be free of any payload
-            before = Rows.concatenate(self.recent[:-after][-every * WINDOW.before :])
+        # rows before must be free of any payload, but the payload may have been picked up within the last cell
+        if self.held is None and (free := self.recent[: -after - every]):
+            before = Rows.concatenate(free[-every * WINDOW.before :])
         held = TrackedPayload.of_rows(carrier, rows, before)
         estimate = held.estimate
         vague = 1 / VERDICT.positive if estimate.gain < VERDICT.at_once_nats else np.inf

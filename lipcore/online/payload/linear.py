@@ -68,4 +68,5 @@ def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: PayloadPrio
         if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < 0.05:
             break
     contact = explain_unloaded(carrier, free, loaded, both.tau, roots)[2]
-    return Estimate(eta, max(1.0, float((left**2).mean())) * spread, load, gain, contact)
+    misfit = float((left**2).mean())
+    return Estimate(eta, max(1.0, misfit) * spread, load, gain, contact, misfit=misfit)

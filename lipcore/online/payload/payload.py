@@ -264,7 +264,7 @@ class _Problem:
         if others:
             wider = _compute_widening(np.sqrt(np.diagonal(of_eta)), [each.point.place.eta - eta for each in found])
             of_eta *= np.outer(wider, wider)
-        return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if sure else OPTIONS.doubt)
+        return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if sure else OPTIONS.doubt, at.misfit)
 
     def gains(self, at: Point) -> tuple[float, float]:
         """Return the nats by which a payload, and a constant torque, explain the rows better than the arm alone.

@@ -11,6 +11,7 @@ from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.learner import OnlineModel
+from lipcore.online.payload.held import TrackedPayload
 from lipcore.online.payload.holding import PayloadTracker
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Simulation, simulate
@@ -78,6 +79,21 @@ def test_quiet_stream_has_no_payload(carrier):
 def test_payload_from_before_the_stream_is_noticed(carrier):
     trackers = track_payload(carrier, simulate_stream(303, 1.0, first=20.5))
     assert next(at for at, tracker in trackers if tracker.held is not None) < 20.5 + 0.7
+
+
+def test_rows_before_a_payload_are_free_of_it(carrier):
+    """The pick-up is within a cell."""
+    held = last_tracker(carrier, simulate_stream(306, 2.0, first=19.02, last=20.5)).held
+    assert held.before.time.max() < UP_S
+
+
+@pytest.mark.parametrize(("first", "kept"), [(19.6, True), (20.1, False)])
+def test_rows_before_a_payload_are_left_out_if_they_contradict_it(carrier, first, kept):
+    rows = simulate_stream(307, 2.0)
+    tracked = TrackedPayload.of_rows(carrier, between(rows, 20.5, 20.9), between(rows, first, first + 0.4))
+    assert bool(len(tracked.before)) == kept
+    mass, std = tracked.estimate.mass
+    assert abs(mass - 2.0) < 2 * std
 
 
 def test_push_on_one_joint_is_a_contact(carrier):
