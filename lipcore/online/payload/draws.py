@@ -76,6 +76,11 @@ class ArmWithPayload:
         w[steps] = self.w[steps] + (learnt.towards(geometry) - learnt.towards(self.geometry)) / carrier.root[steps]
         return ArmWithPayload(w, geometry, self.eta + eta)
 
+    def with_axis(self, joint: int, direction: int) -> ArmWithPayload:
+        """Return the arm with an axis in one of six directions. joint: from base to tip; direction: any number."""
+        layout = tuple(direction % len(DIRECTIONS) if each == joint else None for each in range(self.geometry.n_joints))
+        return replace(self, geometry=apply_layout(self.geometry, layout))
+
 
 @dataclass(frozen=True, eq=False)
 class Draw:
@@ -201,8 +206,7 @@ class Training:
         geometry = carrier.term.arm.geometry.moved(carrier.step)
         learnt = ArmWithPayload(carrier.mean, geometry, ANY_PAYLOAD.centre)
         if carrier.is_tip_unidentified:
-            layout = (*[None] * (geometry.n_joints - 1), number % len(DIRECTIONS))
-            return Draw(replace(learnt, geometry=apply_layout(geometry, layout)), None)  # equally likely a priori
+            return Draw(learnt.with_axis(geometry.n_joints - 1, number), None)  # equally likely a priori
         by = draw.uniform(*DRAWS.wide) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
         at = self.at(learnt.shifted(carrier, by, np.zeros(PARAMETERS)))
         noise = draw.standard_normal(len(at.residual))

@@ -9,7 +9,7 @@ e is the error of the rows' torque, whitened by its covariance, and m the residu
 (`lipcore.model.memory`). Torque is linearised around each step (`lipcore.model.payload`), steps are Levenberg's and
 Marquardt's, and the covariance is that of the linear model around the last step (Laplace): `estimate`, which takes
 milliseconds. If few rows leave a bent valley open, that is too certain: `refine` draws from the posterior, which takes
-a hundred times as long.
+a hundred times as long. If the arm does not explain the rows, it also tries other directions of the last axes (`axes`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.model.payload import Carrier, PayloadPosterior
 from lipcore.online.batch import Rows
+from lipcore.online.payload.axes import OPTIONS as AXES
+from lipcore.online.payload.axes import turn_axes
 from lipcore.online.payload.bodies import ANY_PAYLOAD, PayloadPrior, body, inverse
 from lipcore.online.payload.draws import (
     DRAWS,
@@ -112,15 +114,20 @@ def refine(
     known = () if start is None else start.draws
     # another revision may have another number of residuals
     known = tuple(each for each in known if each.is_usable(len(at.residual) - problem.tau.size))
-    if not known:
+    fresh = not known
+    if fresh:
         begun = yield from draw_arms(carrier)
         known = tuple(_add_payload(each, at) for each in begun)
+    turned = (yield from problem.search_axes(at)) if fresh or anew else []
+    if turned:
+        at = turned[0]
+        known = tuple(_move_draw(each, number, turned) for number, each in enumerate(known))
     found = []
     for number, each in enumerate(known):
-        point = yield from problem.follow_draw(each, number, OPTIONS.draw_steps)
+        point = yield from problem.follow_draw(each, number, OPTIONS.first_steps if turned else OPTIONS.draw_steps)
         found.append(_DrawResult(point, each.noise))
     at = min([at, *(each.point for each in found)], key=_energy)
-    if anew:
+    if anew and not turned:
         for number in [number for number, each in enumerate(found) if each.excess(at) > OPTIONS.far_nats]:
             draw = np.random.default_rng([DRAWS.seed, number, len(rows)])
             again = _add_payload((yield from problem.training.start_draw(number, draw)), at)
@@ -138,6 +145,13 @@ def _energy(at: Point) -> float:
 def _add_payload(arm: Draw, at: Point) -> Draw:
     """Return an arm with the most likely payload."""
     return replace(arm, place=replace(arm.place, eta=at.place.eta))
+
+
+def _move_draw(draw: Draw, number: int, arms: Sequence[Point]) -> Draw:
+    """Return a draw that starts at one of these arms, or at the first with another last axis if it has no noise."""
+    if draw.noise is None:
+        return replace(draw, place=arms[0].place.with_axis(arms[0].place.geometry.n_joints - 1, number))
+    return replace(draw, place=arms[number % len(arms)].place)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +237,13 @@ class _Problem:
         residual = np.concatenate([trained.residual, off])
         residual[first : len(trained.residual)] = root @ (place.eta - self.prior.centre)
         return Point(place, residual, float((off**2).mean()), derivative)
+
+    def search_axes(self, at: Point) -> Generator[None, None, list[Point]]:
+        """Return arms with other axes if `at`, the most likely known, does not explain the rows; see `turn_axes`."""
+        if at.misfit <= AXES.max_misfit or self.carrier.term.arm.mode != "learn":
+            return []
+        learnt = yield from descent(self, self.at(self.make_start(None)), OPTIONS.first_steps)
+        return (yield from turn_axes(self, learnt, at.energy))
 
     def follow_draw(self, begin: Draw, number: int, rounds: int) -> Generator[None, None, Point]:
         """Return the point of a draw from the posterior: the minimum for other noise.
