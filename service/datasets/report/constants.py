@@ -14,6 +14,7 @@ from service.datasets.report.robots import MATCH, bodies_of
 from service.datasets.report.texts import list_names
 from service.datasets.staging import Prepared
 from service.foundation.errors import invalid_data
+from service.foundation.text import percent
 
 MAX_ROWS = 2000
 """Max rows of the comparison."""
@@ -57,7 +58,7 @@ def estimate_constants(prepared: Prepared, robot: Profile) -> EstimatedConstants
     nearest = known[np.abs(np.subtract.outer(np.arange(len(names)), known)).argmin(axis=1)]
     values, unknown = 1 / factor[nearest], np.setdiff1d(np.arange(len(names)), known)
     text = f"torque is motor current times {format_numbers(values.tolist())} N·m/A, estimated from the masses of "
-    text += f"{robot.name} (standard deviation up to {(std / np.abs(factor))[known].max():.0%}"
+    text += f"{robot.name} (standard deviation up to {percent(float((std / np.abs(factor))[known].max()))}"
     if any(light):
         text += f"; {list_names(np.array(names)[light])} by inertia, too low if the URDF lacks rotors"
     if len(unknown):

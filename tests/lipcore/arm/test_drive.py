@@ -19,7 +19,8 @@ from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS, with_deflections
 from lipcore.kernels.drive.terms import KIND_TERMS, drive_features, drive_terms, summary_rows
 from lipcore.model.dynamics import components, forward_dynamics
-from lipcore.model.parameters import friction_coefficients, weight_posterior
+from lipcore.model.parameters import friction_coefficients, report, weight_posterior
+from lipcore.model.warnings import warnings
 from lipcore.robots.dirt import MAXWELL_ELEMENTS, Dirt
 from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate, usual_torque
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
@@ -128,6 +129,10 @@ def test_gains_are_recovered_and_belong_to_the_bodies() -> None:
     motion = Motion.from_arrays(unseen.q[:20], unseen.dq[:20], unseen.ddq[:20])
     parts = components(model, motion, ("gravity", "coriolis", "inertial", "friction"))
     np.testing.assert_allclose(sum(each.mean for each in parts.values()), model.posterior.mean(motion), atol=1e-9)
+    [text] = warnings(model, report(model.posterior, model.estimator, model.joint_names))
+    assert text.startswith("The torque does not fit the masses: ")
+    assert "joint2 reads " in text
+    assert text.endswith("% too high. Check the torque constants or sensors.")
     still = np.zeros_like(motion.q)
     gravity = (1 + GAINS) * inverse_dynamics(ROBOT, motion.q, still, still)
     np.testing.assert_allclose(parts["gravity"].mean, gravity, atol=0.05 * np.abs(gravity).max())
@@ -260,12 +265,13 @@ def test_unknown_kinds_and_a_load_without_arm_are_rejected() -> None:
         Drive(3, ("load",))
 
 
-def test_model_with_load_is_stored_and_restored(tmp_path) -> None:
-    model, unseen = train_friction("load"), simulate_friction(2, "load")
+@pytest.mark.parametrize("kind", ["load", "gain", "position"])
+def test_model_with_a_kind_is_stored_and_restored(kind: DriveKind, tmp_path: Path) -> None:
+    model, unseen = train_friction(kind), simulate_friction(2, kind)
     save(model, tmp_path / "model")
     again = load(tmp_path / "model")
     assert again.arm is not None
-    assert again.arm.drive == ("load",)
+    assert again.arm.drive == (kind,)
     before, after = (each.predict(unseen.q, unseen.dq, unseen.ddq) for each in (model, again))
     np.testing.assert_allclose(after.tau, before.tau, rtol=1e-9)
     np.testing.assert_allclose(after.tau_std, before.tau_std, rtol=1e-6)
