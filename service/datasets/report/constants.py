@@ -19,9 +19,7 @@ from service.foundation.text import percent
 MAX_ROWS = 2000
 """Max rows of the comparison."""
 MIN_STDS = 5.0
-"""Min factor of gravity, in its standard deviations: the constant is then known to 20 %."""
-MIN_VISIBLE = 0.05
-"""Min share of the current's spread that gravity must explain."""
+"""Min factor of gravity or inertia, in its standard deviations: the constant is then known to 20 %."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +46,10 @@ def estimate_constants(prepared: Prepared, robot: Profile) -> EstimatedConstants
     if bodies is None:
         raise _missing(len(names), f"robot {robot.name} has no URDF with masses of these joints")
     found = compare(bodies, Signals(*(staged.table(each, rows) for each in ("q", "dq", "ddq", "tau"))))
-    heavy = (np.abs(found.gravity) > MIN_STDS * found.gravity_std) & (found.explained > MATCH.explained)
-    heavy &= np.abs(found.gravity) * found.visible[:, 0] > MIN_VISIBLE
-    light = [not heavy[joint] and found.is_significant(joint, 1) for joint in range(len(names))]
+    fits = found.explained > MATCH.explained
+    heavy = fits & (np.abs(found.gravity) > MIN_STDS * found.gravity_std)
+    # a negative factor of inertia is an error of friction
+    light = fits & ~heavy & (found.inertia > MIN_STDS * found.inertia_std)
     known = np.flatnonzero(heavy | light)
     if not len(known):
         raise _missing(len(names), f"the currents do not show the masses of robot {robot.name}")
@@ -59,7 +58,7 @@ def estimate_constants(prepared: Prepared, robot: Profile) -> EstimatedConstants
     values, unknown = 1 / factor[nearest], np.setdiff1d(np.arange(len(names)), known)
     text = f"torque is motor current times {format_numbers(values.tolist())} N·m/A, estimated from the masses of "
     text += f"{robot.name} (standard deviation up to {percent(float((std / np.abs(factor))[known].max()))}"
-    if any(light):
+    if light.any():
         text += f"; {list_names(np.array(names)[light])} by inertia, too low if the URDF lacks rotors"
     if len(unknown):
         text += f"; {list_names(np.array(names)[unknown])} like the nearest joint, as no mass is visible"
