@@ -15,7 +15,7 @@ from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES
 from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, watch
-from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
+from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json, print_warnings
 from service.cli.models import print_held_out, print_promotion, print_selection
 from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Promotion, Url, alone, group, names, pairs, value
 from service.foundation.text import percent
@@ -241,6 +241,7 @@ def train(
     if made.lineage.get("holdout") is not None:
         print_held_out(made)
     print_promotion(made)
+    print_warnings(made.warnings)
     if waits:
         note(f"`lipserve models promote {model} {job.version}` makes it the serving version")
 
