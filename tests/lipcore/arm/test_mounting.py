@@ -14,6 +14,7 @@ from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
+from tests.choosing import slow
 from tests.lipcore.arm_oracles import as_robot, nmse_per_joint
 from tests.lipcore.arms import random_bodies, random_geometry
 
@@ -54,7 +55,7 @@ def test_robot_as_in_its_urdf_has_no_other_mounting() -> None:
     assert texts(model) == ""
 
 
-@pytest.mark.parametrize("position", ["upside down", WALL])
+@pytest.mark.parametrize("position", [slow("upside down"), WALL])
 def test_other_position_of_the_base_is_found(position: str) -> None:
     turn = np.array(POSITIONS[position])
     model = train_with_urdf(record(turn))
