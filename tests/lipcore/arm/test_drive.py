@@ -19,7 +19,7 @@ from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS, with_deflections
 from lipcore.kernels.drive.terms import KIND_TERMS, drive_features, drive_terms, summary_rows
 from lipcore.model.dynamics import components, forward_dynamics
-from lipcore.model.parameters import friction_coefficients, report, weight_posterior
+from lipcore.model.parameters import friction_coefficients, negative_friction, report, weight_posterior
 from lipcore.model.warnings import warnings
 from lipcore.robots.dirt import MAXWELL_ELEMENTS, Dirt
 from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate, usual_torque
@@ -254,6 +254,17 @@ def test_report_of_curved_friction_is_a_line_through_its_curve() -> None:
         odd = 0.5 * (curve[speed] - curve[-speed])
         assert rows["coulomb"] @ weights + speed * (rows["viscous"] @ weights) == pytest.approx(odd)
     assert rows["offset"] @ weights == pytest.approx(0.5 * (curve[0.1] + curve[-0.1]))
+
+
+def test_negative_friction_is_found() -> None:
+    samples = simulate_friction(1)
+    wrong = replace(samples, tau=samples.tau - 0.8 * np.tanh(samples.dq / 0.02))
+    model = train_from_geometry(GEOMETRY, ROBOT, wrong, FitOptions(device="cpu"))
+    found = [each for each in negative_friction(model.posterior, model.estimator) if each.is_implausible(2.0)]
+    assert [(each.joint, each.name) for each in found] == [(0, "coulomb"), (1, "coulomb"), (2, "coulomb")]
+    assert all(each.mean == pytest.approx(-0.4, abs=0.05) for each in found)
+    right = train_friction("load")
+    assert not [each for each in negative_friction(right.posterior, right.estimator) if each.is_implausible(2.0)]
 
 
 def test_unknown_kinds_and_a_load_without_arm_are_rejected() -> None:
