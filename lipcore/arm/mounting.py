@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.linalg import LinAlgError
 from scipy.linalg import cho_solve
 
 from lipcore.arm.problem import GeometryPrior, Point, Problem, root_of
@@ -89,7 +90,10 @@ def find_position(problem: Problem, point: Point, steps: int, stop: Callable[[],
     for position in list(POSITIONS)[1:]:
         start = mount(problem.expected.around, position)
         mounted = around(problem, start)
-        trial = mounted.descend(start, point.sigma, OPTIONS.rounds, stop)
+        try:
+            trial = mounted.descend(start, point.sigma, OPTIONS.rounds, stop)
+        except LinAlgError:  # far from any optimum
+            continue
         if trial.value < min(best[2].value, point.value - OPTIONS.min_nats):
             best = position, mounted, trial
     position, mounted, trial = best
