@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from lipcore.arm import mounting, right_angles
+from lipcore.arm import right_angles
 from lipcore.arm.drive import choose_drive
-from lipcore.arm.mounting import Zeros
+from lipcore.arm.mounting import Mounting, find_mounting
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_load, with_samples
 from lipcore.arm.problem import WIDTHS, Point, Problem, root_of
 from lipcore.arm.right_angles import Candidate, Layout
@@ -103,16 +103,15 @@ def learn(
         problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples)
         if task.sibling is not None:
             problem = replace(problem, scale_width=WIDTHS.unit)
-        urdf, position = mode == "calibrate" and task.sibling is None, ""
+        urdf = mode == "calibrate" and task.sibling is None
         result: SearchResult | None = None
         if mode == "learn" and not begin:
             result = _search(task, problem, order, chosen, known, seed, watch)
             starts = [(each.geometry, each.sigma) for each in result.points[: OPTIONS.polished]]
         else:
-            sigma = noise.start(samples)[order]
             if around is not None and (mode == "fixed" or not begin or urdf):
                 begin = [around.geometry]
-            starts = [(each, sigma) for each in begin]
+            starts = [(each, noise.start(samples)[order]) for each in begin]
         polished = Pool(problem.recombined(OPTIONS.check_motions))
         for geometry, sigma in starts:
             polished.add(problem.descend(geometry, sigma, OPTIONS.polish_steps, watch.stop))
@@ -123,10 +122,10 @@ def learn(
         )
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        zeros: Zeros | None = None
+        mounting: Mounting | None = None
         if urdf:
-            position, problem, ends[0] = mounting.find_position(problem, ends[0], OPTIONS.polish_steps, watch.stop)
-            problem, ends[0], zeros = mounting.find_zeros(problem, ends[0], OPTIONS.round_steps, watch.stop)
+            mounting = find_mounting(problem, ends[0], OPTIONS.polish_steps, watch.stop)
+            problem, ends = mounting.problem, [mounting.point]
         found, drive_nats = _refine(problem, ends, counting, watch, known if mode == "learn" else None, rows)
         best, problem = found[0].point, found[0].problem
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
@@ -147,8 +146,8 @@ def learn(
             "seconds": time.monotonic() - watch.began,
             "device": "cpu",
         }
-        if zeros is not None:
-            report |= _report_mounting(position, problem, best, zeros, order)
+        if mounting is not None:
+            report |= mounting.report(best.geometry, order)
         if mode == "learn":
             sure = right_angles.right_angle_probabilities(found)[np.argsort(order)]
             report |= {f"right_angle_{joint + 1}": round(float(each), 3) for joint, each in enumerate(sure)}
@@ -313,26 +312,6 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
     stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)
     return bool(np.any(np.sqrt(np.mean((means[0] - means[1]) ** 2, axis=0)) > OPTIONS.min_difference * stated))
-
-
-def _report_mounting(
-    position: str, problem: Problem, best: Point, zeros: Zeros, order: NDArray[np.int64]
-) -> dict[str, float | int | bool | str]:
-    """Return the mounting of a known robot where it differs from the URDF's: degrees, or mm for prismatic joints."""
-    assert problem.expected is not None
-    assert problem.expected.around is not None
-    out: dict[str, float | int | bool | str] = {"zero_nats": zeros.nats}
-    if position != mounting.UPRIGHT:
-        out["mounting"] = position
-    if best.geometry.gravity.any():
-        out["base_tilt"] = round(mounting.tilt_deg(best.geometry, problem.expected.around), 3)
-    if not zeros.nats:
-        return out
-    for joint, place in enumerate(np.argsort(order)):
-        unit = float(np.degrees(1.0)) if best.geometry.joint_types[place] == "revolute" else 1e3
-        out[f"zero_{joint + 1}"] = round(unit * float(zeros.mean[place]), 3)
-        out[f"std_of_zero_{joint + 1}"] = round(unit * float(zeros.std[place]), 3)
-    return out
 
 
 def _search_report(

@@ -20,6 +20,7 @@ from scipy.linalg import cho_solve
 
 from lipcore.arm.problem import GeometryPrior, Point, Problem, root_of
 from lipcore.arm.scales import rescale
+from lipcore.data.motion import Indices
 from lipcore.data.samples import Array
 from lipcore.kernels.fast.arm import arm_torques
 from lipcore.kernels.geometry import Geometry, rotation_of
@@ -38,7 +39,7 @@ class MountingOptions:
     min_zero_nats: float = 3.0
     """Min gain in evidence of the zeros."""
     rounds: int = 3
-    """Max steps of the zeros."""
+    """Max steps of a first descent at a position, and max steps of the zeros."""
     step: float = 1e-4
     """Step of the derivative by position, rad (m)."""
 
@@ -66,6 +67,47 @@ class Zeros:
     """Posterior standard deviations, (n,)."""
     nats: float
     """Gain in evidence."""
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """The mounting of a known robot, and the problem and its optimum with it."""
+
+    position: str
+    """One of POSITIONS."""
+    zeros: Zeros
+    problem: Problem
+    point: Point
+
+    def report(self, geometry: Geometry, order: Indices) -> dict[str, float | int | bool | str]:
+        """Return where it differs from the URDF's, degrees, or mm for zeros of prismatic joints.
+
+        geometry: as learnt in the end; order: (n,), the data's joint at each place of the chain.
+        """
+        assert self.problem.expected is not None
+        assert self.problem.expected.around is not None
+        out: dict[str, float | int | bool | str] = {"zero_nats": self.zeros.nats}
+        if self.position != UPRIGHT:
+            out["mounting"] = self.position
+        if geometry.gravity.any():
+            out["base_tilt"] = round(tilt_deg(geometry, self.problem.expected.around), 3)
+        if self.zeros.nats:
+            for joint, place in enumerate(np.argsort(order)):
+                unit = float(np.degrees(1.0)) if geometry.joint_types[place] == "revolute" else 1e3
+                out[f"zero_{joint + 1}"] = round(unit * float(self.zeros.mean[place]), 3)
+                out[f"std_of_zero_{joint + 1}"] = round(unit * float(self.zeros.std[place]), 3)
+        return out
+
+
+def find_mounting(problem: Problem, point: Point, steps: int, stop: Callable[[], bool]) -> Mounting:
+    """Return the mounting with the highest evidence.
+
+    point: the optimum as in the URDF; steps: max steps of a descent; stop: called at every step. Raise LinAlgError if
+    the evidence cannot be computed.
+    """
+    position, problem, point = find_position(problem, point, steps, stop)
+    problem, point, zeros = find_zeros(problem, point, steps, stop)
+    return Mounting(position, zeros, problem, point)
 
 
 def mount(geometry: Geometry, position: str) -> Geometry:
@@ -124,10 +166,10 @@ def find_zeros(problem: Problem, point: Point, steps: int, stop: Callable[[], bo
     """
     assert problem.expected is not None
     assert problem.expected.around is not None
-    total, found, nats = np.zeros(problem.n_joints), estimate_zeros(problem, point, 0.0), 0.0
-    if found.nats < OPTIONS.min_zero_nats:
-        return problem, point, replace(found, mean=total, nats=0.0)
+    total, found = np.zeros(problem.n_joints), estimate_zeros(problem, point, 0.0)
     nats = found.nats
+    if nats < OPTIONS.min_zero_nats:
+        return problem, point, replace(found, mean=total, nats=0.0)
     for _ in range(OPTIONS.rounds):
         problem = around(problem, turn_joints(problem.expected.around, found.mean))
         point = problem.descend(turn_joints(point.geometry, found.mean), point.sigma, steps, stop)
