@@ -58,7 +58,8 @@ def describe_put_down(stream_id: str) -> str:
 def describe_coefficient(joint: str, name: FrictionName, mean: float, std: float, unit: str) -> str:
     """Return a coefficient of friction of a joint, as `describe_friction` lists it."""
     what = {"viscous": "viscous", "coulomb": "Coulomb", "load": "share of the load"}[name]
-    return f"{joint} ({what} {mean:.2g} ± {std:.1g}{unit})".replace("-", "−")
+    number = f"{mean:.2g}".replace("-", "−")  # joint names keep their hyphens
+    return f"{joint} ({what} {number} ± {std:.1g}{unit})"
 
 
 def describe_friction(coefficients: Sequence[str]) -> str:
