@@ -56,9 +56,9 @@ class DeclaredPayloads:
         model = carrier.with_payload(carrier.known(body.parameters))
         model.answer(np.zeros((3, model.n_joints)))  # loads its arrays into memory
         with self._lock:
-            self._kept[payload] = model
-            if len(self._kept) > MAX_KEPT_MODELS:
+            if len(self._kept) >= MAX_KEPT_MODELS:
                 del self._kept[next(iter(self._kept))]
+            self._kept[payload] = model
         return model
 
     @cached_property
