@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# with that variable every process compiles all modules again
+unexport PYTHONDONTWRITEBYTECODE
 # one thread a process: the tests' matrices are small, and several processes run at a time
 TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 # parallel test processes; tests that share a service run in the same process: tests/conftest.py
@@ -29,7 +31,7 @@ warm-chain: install
 # (errors of the collection are ignored here; `make test` shows them)
 bytecode: install
 	$(BIN)/python -m compileall -q lipcore service clients/python/lipserve benchmarks
-	PYTHONDONTWRITEBYTECODE= $(TEST) --collect-only -q -m "not slow" $(TESTS) > /dev/null || true
+	$(TEST) --collect-only -q -m "not slow" $(TESTS) > /dev/null || true
 
 # tests of the API that also run on PostgreSQL and S3
 SHARED := $(addprefix tests/service/, \
@@ -72,7 +74,7 @@ cpp:
 	cmake --build build/cpp
 	ctest --test-dir build/cpp --output-on-failure
 
-lint: install-all
+lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -120,24 +122,34 @@ install: $(VENV)/.installed
 
 install-all: $(VENV)/.installed-all
 
-# an environment that can run the service
-$(VENV)/.running: pyproject.toml clients/python/pyproject.toml hatch_build.py
-	@echo "installing into $(VENV): one to two minutes"
+# pip compiles no bytecode: most of it is never imported. The value 0 means that, 1 does not
+export PIP_NO_COMPILE := 0
+
+# with the newest pip: that of Python 3.11 takes twice as long
+$(VENV)/.created:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is required; this is " + sys.version)'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e clients/python -e '.[sim,ingest]'
+	$(PYTHON) -m venv --upgrade-deps $(VENV)
 	@touch $@
 
-# the same with the dependencies of `make test`
-$(VENV)/.installed: $(VENV)/.running .ci/install-torch
-	@echo "installing dependencies of the tests into $(VENV): one minute"
-	.ci/install-torch $(BIN)/python
-	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e clients/python -e '.[train,sim,ingest,plot,grpc,test]'
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e
+PROJECT := $(VENV)/.created pyproject.toml clients/python/pyproject.toml hatch_build.py
+
+# an environment that can run the service
+$(VENV)/.running: $(PROJECT)
+	@echo "installing into $(VENV): one to two minutes"
+	$(INSTALL) '.[sim,ingest]'
 	@touch $@
+
+# the same with the dependencies of `make test` and `make lint`
+$(VENV)/.installed: $(PROJECT) .ci/install-torch
+	@echo "installing into $(VENV): two minutes"
+	.ci/install-torch $(BIN)/python
+	$(INSTALL) '.[all,test,lint]'
+	@touch $@ $(VENV)/.running
 
 # the same with the dependencies of everything else
 $(VENV)/.installed-all: $(VENV)/.installed
-	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e clients/python -e '.[dev]'
+	$(INSTALL) '.[dev]'
 	@touch $@
 
 clean:
