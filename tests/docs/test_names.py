@@ -33,8 +33,9 @@ def sources(*folders: str, ends: tuple[str, ...] = (".py",)) -> Iterator[Path]:
 
 def words_of(tree: ast.AST) -> Iterator[str]:
     """Yield the words of names and strings of code, without its docstrings."""
-    docstrings = {id(each.value) for each in ast.walk(tree) if is_text(each)}
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(tree))
+    docstrings = {id(each.value) for each in nodes if is_text(each)}
+    for node in nodes:
         if id(node) not in docstrings:
             for value in vars(node).values():
                 for text in value if isinstance(value, list) else [value]:

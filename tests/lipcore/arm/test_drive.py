@@ -24,7 +24,7 @@ from lipcore.model.warnings import warnings
 from lipcore.robots.dirt import MAXWELL_ELEMENTS, Dirt
 from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate, usual_torque
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
-from tests.choosing import slow
+from tests.choosing import few
 from tests.lipcore.arm_oracles import arm, nmse_per_joint, train_from_geometry
 from tests.lipcore.files.test_persistence import edit_tensor
 
@@ -78,7 +78,7 @@ def pose(samples: Samples) -> tuple[Problem, Point]:
     return problem, problem.with_noise(problem.at(GEOMETRY.canonical(), 0.05 * samples.tau.std(axis=0)))
 
 
-@pytest.mark.parametrize("kind", ["load", "gain", "position", slow("speed"), slow("sides")])
+@pytest.mark.parametrize("kind", few(["load", "gain", "position", "speed", "sides"], kept=lambda kind: kind == "load"))
 def test_supported_kind_is_chosen_and_predicts_better(kind: DriveKind, monkeypatch: pytest.MonkeyPatch) -> None:
     model, unseen = train_friction(kind), simulate_friction(2, kind)
     assert kind in str(model.fit["drive"])

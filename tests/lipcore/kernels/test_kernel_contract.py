@@ -244,6 +244,7 @@ def assert_close(found: Array, expected: Array, share: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=share * np.abs(expected).max(initial=0.0))
 
 
+@pytest.mark.each_once
 @robots
 @every_kernel
 def test_covariances_equal_the_formula(name: str, joint_types: tuple[str, ...]) -> None:
@@ -264,6 +265,7 @@ def test_covariances_equal_the_formula(name: str, joint_types: tuple[str, ...]) 
         assert_close(kernel.variance(params, y), blocks, RELATIVE_TOLERANCE)
 
 
+@pytest.mark.each_once
 @robots
 @every_kernel
 def test_gradient_equals_automatic_differentiation(name: str, joint_types: tuple[str, ...]) -> None:
@@ -285,6 +287,7 @@ def test_gradient_equals_automatic_differentiation(name: str, joint_types: tuple
             np.testing.assert_allclose(found[key], expected, rtol=0, atol=bound, err_msg=key)
 
 
+@pytest.mark.each_once
 @robots
 @every_kernel
 def test_query_covariances_equal_the_formula(name: str, joint_types: tuple[str, ...]) -> None:

@@ -1,6 +1,7 @@
 """Tests of tracking a stream's payload: detection, removal, declaration, quiet streams and contacts."""
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -27,12 +28,17 @@ def carrier():
     return Carrier(load(ROOT / "models" / "panda-sim"))
 
 
+@cache
+def simulate_panda(seed, mass, noise):
+    """Return samples of a Panda that carries a mass off its last axis."""
+    payload = Payload(mass, 0.0, (0.02, 0.02, 0.08)) if mass else None
+    return simulate(load_robot("panda"), Simulation(2400, RATE, speed=5.0, noise=noise, payload=payload), seed)
+
+
 def simulate_stream(seed, mass=0.0, noise=0.05, first=19.0, last=23.0):
-    """Return rows of a Panda that carries a mass, off its last axis, from UP_S to DOWN_S."""
-    motion = Simulation(2400, RATE, speed=5.0, noise=noise)
-    payloads = None, Payload(mass, 0.0, (0.02, 0.02, 0.08))
-    free, full = (simulate(load_robot("panda"), replace(motion, payload=payload), seed) for payload in payloads)
-    carried = ((free.t >= UP_S) & (free.t < DOWN_S))[:, None] & (mass > 0)
+    """Return rows of a Panda that carries a mass from UP_S to DOWN_S."""
+    free, full = (simulate_panda(seed, each, noise) for each in (0.0, mass))
+    carried = ((free.t >= UP_S) & (free.t < DOWN_S))[:, None]
     return between(as_rows(replace(free, tau=np.where(carried, full.tau, free.tau)), 0.0), first, last)
 
 
@@ -107,13 +113,11 @@ def test_push_on_one_joint_is_a_contact(carrier):
 
 def test_friction_that_grows_with_the_payload_has_not_changed(carrier):
     """The arm's friction is a tenth of the payload's torque larger, which its training does not know."""
-    motion = Simulation(2000, RATE, speed=5.0, noise=0.05)
-    payloads = None, Payload(1.5, 0.0, (0.02, 0.02, 0.08))
-    free, full = (simulate(load_robot("panda"), replace(motion, payload=payload), 301) for payload in payloads)
+    free, full = (simulate_panda(301, mass, 0.05) for mass in (0.0, 1.5))
     weight = full.tau - free.tau
     rubbing = 0.1 * np.abs(weight) * np.tanh(free.dq / SIGN_WIDTH)
     tau = free.tau + (free.t >= 14.0)[:, None] * (weight + rubbing)
-    trackers = track_payload(carrier, between(as_rows(replace(free, tau=tau), 0.0), 13.0))
+    trackers = track_payload(carrier, between(as_rows(replace(free, tau=tau), 0.0), 13.0, 20.0))
     assert {tracker.state for at, tracker in trackers if at > 15.0} == {"payload"}
     mass, std = trackers[-1][1].held.estimate.mass
     assert abs(mass - 1.5) < 1.96 * std

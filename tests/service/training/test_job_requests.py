@@ -1,5 +1,7 @@
 """Invalid training requests: each is rejected with the wrong field named, and no job is created."""
 
+from functools import cache
+
 import pytest
 
 from lipcore.vocabulary import ESTIMATOR_CHOICES
@@ -9,17 +11,20 @@ from tests.service.training.conftest import assert_invalid
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 40, "max_iterations": 4}
 
 
+DATASETS = {
+    "one": (stream(), {}),
+    "two": (stream(seed=2), {}),
+    "other": (stream("asr-twodof"), {}),
+    "compensated": (stream(), {"torque_convention": "gravity_compensated"}),
+}
+"""Two data sets of one robot, one of another robot and one of another convention."""
+
+
 @pytest.fixture
-def datasets(no_worker):
-    """Two data sets of one robot, one of another robot and one of another convention; no job uses them."""
-    result = {
-        "one": upload(no_worker, stream())["id"],
-        "two": upload(no_worker, stream(seed=2))["id"],
-        "other": upload(no_worker, stream("asr-twodof"))["id"],
-        "compensated": upload(no_worker, stream(), torque_convention="gravity_compensated")["id"],
-    }
+def dataset(no_worker):
+    """Upload a data set once; return its id. No job uses it."""
     before = no_worker.get("/v1/jobs").json()
-    yield result
+    yield cache(lambda name: upload(no_worker, DATASETS[name][0], **DATASETS[name][1])["id"])
     assert no_worker.get("/v1/jobs").json() == before
 
 
@@ -43,12 +48,12 @@ def post_job(api, *datasets, **request):
         (["one"], {"promotion": True}, "promotion", ""),
     ],
 )
-def test_invalid_request_is_rejected(no_worker, datasets, names, request_, field, message):
-    assert_invalid(post_job(no_worker, *(datasets[name] for name in names), **request_), field, message)
+def test_invalid_request_is_rejected(no_worker, dataset, names, request_, field, message):
+    assert_invalid(post_job(no_worker, *map(dataset, names), **request_), field, message)
 
 
-def test_unknown_estimator_is_rejected_with_the_known_ones(no_worker, datasets):
-    reply = error(post_job(no_worker, datasets["one"], estimator="magic"), 422, "invalid_request")
+def test_unknown_estimator_is_rejected_with_the_known_ones(no_worker, dataset):
+    reply = error(post_job(no_worker, dataset("one"), estimator="magic"), 422, "invalid_request")
     expected = f"one of {', '.join(ESTIMATOR_CHOICES)}"
     assert reply["detail"][0] == {"field": "estimator", "value": "magic", "expected": expected}
 

@@ -13,11 +13,18 @@ from service.storage.database import Base, Database
 from tests.service.data import ADDRESS
 from tests.service.learning.learning_models import observation_batch
 from tests.service.runtime.work import ordered_floats
+from tests.service.warm import warm_processes
 from tests.system.cluster.pairs import Pair, predict_at_revision, train
 from tests.system.cluster.servers import Postgres, Shared, sharing
 from tests.system.cluster.workers import cluster
 
 pytestmark = pytest.mark.journey
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _warm_processes() -> Iterator[None]:
+    with warm_processes():
+        yield
 
 
 @pytest.fixture(scope="module")
