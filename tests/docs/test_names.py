@@ -33,9 +33,8 @@ def sources(*folders: str, ends: tuple[str, ...] = (".py",)) -> Iterator[Path]:
 
 def words_of(tree: ast.AST) -> Iterator[str]:
     """Yield the words of names and strings of code, without its docstrings."""
-    nodes = list(ast.walk(tree))
-    docstrings = {id(each.value) for each in nodes if is_text(each)}
-    for node in nodes:
+    docstrings = {id(each.value) for each in ast.walk(tree) if is_text(each)}
+    for node in ast.walk(tree):
         if id(node) not in docstrings:
             for value in vars(node).values():
                 for text in value if isinstance(value, list) else [value]:
@@ -71,7 +70,7 @@ def known() -> set[str]:
 
 def unknown(text: str, known: set[str]) -> list[str]:
     """Return the names of a text that are not known; `joint_1` counts as known if `joint` is."""
-    bare = r"\d+$", r"_?\d+$", r"$^"
+    bare = r"$^", r"\d+$", r"_?\d+$"
     return [
         name
         for name in NAME.findall(text)
