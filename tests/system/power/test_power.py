@@ -61,7 +61,6 @@ def check_recording_is_complete(recording: Recording) -> None:
     assert [path for path in visible if visible[path] != there[path] and not path.endswith(disk.MAPPED_SUFFIX)] == []
 
 
-@pytest.mark.journey
 def test_power_cuts_during_each_kind_of_request(tmp_path):
     recording = Recording(tmp_path / "recorded")
     with RecordedService(recording, homes.populated_home(recording)) as service:
