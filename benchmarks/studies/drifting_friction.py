@@ -26,6 +26,7 @@ from lipcore.data.independence import stream_weights
 from lipcore.data.metrics import evaluate
 from lipcore.data.samples import Array, Samples
 from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.drive.play import element_widths, with_deflections
 from lipcore.model.parameters import weight_posterior
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
@@ -69,6 +70,9 @@ CASES = {
     "dirty, 13 % in 5 min": Case(Dirt()),
     "dirty, 30 % in 10 min": Case(WARMS),
     "dirty, the next morning": Case(WARMS, cold=20),
+    "Maxwell slip, viscosity falls by a third in 10 min": Case(
+        Dirt(drive="maxwell", warmth=0.0, viscous_warmth=0.5, warm_s=600.0)
+    ),
 }
 OPTIONS: dict[str, dict[str, float]] = {
     DEFAULT: {},
@@ -98,14 +102,15 @@ def simulated(name: str, case: Case, seed: int) -> tuple[Samples, list[Part]]:
             stream = replace(stream, viscous=factor * VISCOUS, coulomb=factor * COULOMB)
         else:
             since = -1 if case.cold is None else case.cold  # the minute of the cold start
-            warmth = case.dirt.warmth * np.exp(-60.0 * (minute - since) / case.dirt.warm_s) if minute >= since else 0.0
-            stream = replace(stream, dirt=replace(case.dirt, seed=seed, warmth=float(warmth)))
+            left = float(np.exp(-60.0 * (minute - since) / case.dirt.warm_s)) if minute >= since else 0.0
+            excess = {"warmth": left * case.dirt.warmth, "viscous_warmth": left * case.dirt.viscous_warmth}
+            stream = replace(stream, dirt=replace(case.dirt, seed=seed, **excess))
         samples = simulate(robot, stream, 1000 * seed + minute + 1)
         if minute < 0:
             known = samples if case.dirt else replace(samples, tau=_noisy(samples.tau, rng))
             known = prepared(known) if case.dirt else known.rows(slice(None, None, KEEP))
             continue
-        samples = samples.rows(slice(None, None, KEEP))
+        samples = with_deflections(samples, robot.joint_types).rows(slice(None, None, KEEP))
         pause = NIGHT_S if case.cold is not None and minute >= case.cold else 0.0
         samples = replace(samples, t=samples.t + begin + pause)
         parts.append(Part(samples, samples.tau if case.dirt else _noisy(samples.tau, rng)))
@@ -117,11 +122,11 @@ def _noisy(tau: Array, rng: np.random.Generator) -> Array:
     return np.asarray(tau + NOISE * rng.standard_normal(tau.shape))
 
 
-def rows_of(part: Part) -> Rows:
+def rows_of(part: Part, widths: Array) -> Rows:
     """Return all rows with their weights."""
     samples = part.samples
-    codes = np.full(len(samples), Code.LEARNT, np.uint8)
-    return Rows(samples.t, samples.q, samples.dq, samples.ddq, part.tau, codes, stream_weights(samples.t))
+    rows = Rows(samples.t, samples.q, samples.dq, samples.ddq, part.tau, np.full(len(samples), Code.LEARNT, np.uint8))
+    return replace(rows, weight=stream_weights(samples.t), deflections=samples.deflections, widths=widths)
 
 
 def body(model: TorqueModel) -> tuple[Array, Array]:
@@ -145,14 +150,15 @@ class Found:
 
 def followed(base: TorqueModel, parts: list[Part], options: dict[str, float]) -> Found:
     """Learn a stream with these options, and test its last minutes."""
-    online, model = OnlineModel.start(base, **options, since=0.0), base
-    step, answers = round(EVERY_S * RATE / KEEP), []
+    started = OnlineModel.start(base, forgetting_s=options.get("forgetting_s"), since=0.0)
+    online, model = started.with_walk(options.get("friction_walk_s")), base
+    step, answers, widths = round(EVERY_S * RATE / KEEP), [], element_widths(base.joint_types)
     for minute, part in enumerate(parts):
-        rows = rows_of(part)
+        rows = rows_of(part, widths)
         for first in range(0, len(rows), step):
             chunk = rows.take(slice(first, first + step))
             if minute >= MINUTES - TEST_MINUTES:
-                answer = model.predict(chunk.q, chunk.dq, chunk.ddq)
+                answer = model.predict(chunk.q, chunk.dq, chunk.ddq, deflections=chunk.deflections)
                 answers.append([answer.tau, answer.tau_std])
             online = online.learn(chunk)
             model = online.model()

@@ -161,7 +161,7 @@ class SearchResult:
     ended: str
     """`idle`, or `time` if the time limit was reached first."""
     seconds: float
-    """Duration, s."""
+    """Processor time, s."""
 
 
 def search(
@@ -176,9 +176,9 @@ def search(
 ) -> SearchResult:
     """Return the geometries of the best evidence. `problem` contains few rows, some eighty.
 
-    sensor_noise: (n,) N·m, white noise of the signals; seconds: time limit; known: additional start geometries; step:
-    called with the best value and the fraction of the work after each descent, may raise to end the search. Raise
-    LinAlgError if the evidence of no start can be computed.
+    sensor_noise: (n,) N·m, white noise of the signals; seconds: limit of processor time, which other processes of the
+    machine do not use up; known: additional start geometries; step: called with the best value and the fraction of the
+    work after each descent, may raise to end the search. Raise LinAlgError if the evidence of no start can be computed.
     """
     rng = np.random.default_rng(seed)
     pool = Pool(problem.recombined(OPTIONS.check_motions))
@@ -187,12 +187,12 @@ def search(
     drawn = [draw(rng, joint_types, gravity) for _ in range(OPTIONS.screened)]
     with suppress(LinAlgError):
         problem.descend(drawn[0], wide, 1)  # compiles missing code, which must not count as search time
-    began = time.monotonic()
+    began = time.thread_time()
     ranked = sorted(drawn, key=lambda each: _value(problem, each, wide))
     begin = [*known, *ranked[: OPTIONS.starts]]
 
     def late() -> bool:
-        return time.monotonic() - began > seconds
+        return time.thread_time() - began > seconds
 
     def descend(geometry: Geometry, sigma: Array) -> None:
         try:
@@ -221,7 +221,7 @@ def search(
         hops += 1
         quiet = 0 if pool.best < before - OPTIONS.min_gain_nats else quiet + 1
         if step is not None:
-            step(pool.best, 0.4 + 0.6 * max(quiet / OPTIONS.max_idle, (time.monotonic() - began) / seconds))
+            step(pool.best, 0.4 + 0.6 * max(quiet / OPTIONS.max_idle, (time.thread_time() - began) / seconds))
     best = pool.points[0]
     return SearchResult(
         tuple(pool.points),
@@ -231,7 +231,7 @@ def search(
         sum(1 for value in pool.ends if value < best.value + OPTIONS.same_nats),
         _explained(best, sensor_noise, problem.floor),
         "time" if late() else "idle",
-        time.monotonic() - began,
+        time.thread_time() - began,
     )
 
 

@@ -48,7 +48,7 @@ class FitOptions:
     """Geometry of rigid bodies: "learn", "calibrate" (around the URDF), "fixed" (that of the URDF), or "auto":
     calibrated if there is a robot, else learnt."""
     search_seconds: float = 30.0
-    """Time limit of the search for a geometry, s."""
+    """Max processor time of the search for a geometry, s. The search lasts longer on a busy machine."""
 
     def __post_init__(self) -> None:
         for name, low, high in (

@@ -38,8 +38,8 @@ def describe_dependent_motion(dimensions: float, joints: int) -> str:
 def describe_search_limit(seconds: float) -> str:
     """Return the warning that the search for the geometry ended early."""
     return (
-        f"The search for the geometry stopped at its time limit of {seconds:g} s (`search_seconds`). A longer search "
-        "may find a better geometry."
+        f"The search for the geometry stopped after {seconds:g} s of processor time (`search_seconds`). A longer "
+        "search may find a better geometry."
     )
 
 

@@ -48,7 +48,10 @@ class Options(BaseModel):
         "the robot's URDF or `base`, or `fixed` to it; `auto`: calibrate if there is one, else learn",
     )
     search_seconds: float = Field(
-        _DEFAULTS.search_seconds, gt=0, le=MAX_SEARCH_SECONDS, description="Time limit of the geometry search, s"
+        _DEFAULTS.search_seconds,
+        gt=0,
+        le=MAX_SEARCH_SECONDS,
+        description="Max processor time of the search for a geometry, s",
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto",

@@ -87,7 +87,7 @@ def test_second_arm_is_reported_with_a_distinguishing_motion(model: TorqueModel)
 
 def test_end_of_the_fit_is_reported(model: TorqueModel) -> None:
     late, coarse = warnings(replace(model, fit={**model.fit, "search_ended": "time", "search_explained": False}), {})
-    assert "time limit of 10 s" in late
+    assert "after 10 s of processor time" in late
     assert coarse.endswith("Compare with rigid-body+lip-chain.")
     failed = warnings(replace(model, fit={**model.fit, REFIT_ERROR: "ValueError: no"}), {})
     assert failed == [describe_failed_fit("ValueError: no")]
