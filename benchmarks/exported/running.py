@@ -22,6 +22,7 @@ from benchmarks.workload import BenchError, simulator
 from lipcore.data.samples import Array
 from lipcore.export.c_writer import SOURCE, ModelOrigin, c_files
 from lipcore.files.persistence import load
+from lipcore.model.torque_model import TrainingRange
 from lipcore.robots.library import Robot, pinocchio
 
 HERE = Path(__file__).parent
@@ -37,10 +38,10 @@ class Options:
     Attributes:
         folder: folder of the model.
         calls: calls of each function.
-        queries: number of random states.
+        queries: number of instants of the motion.
         flags: compiler flags.
         eigen: folder of Eigen's headers, to call Pinocchio from C++; None: from Python.
-        seed: seed of the states.
+        seed: seed of the motion.
     """
 
     folder: Path
@@ -70,9 +71,7 @@ def run(options: Options, console: Console) -> Results:
     """Run the benchmark; raise BenchError if a compiler or a program fails."""
     model = load(options.folder)
     results = Results(facts.machine(), model.estimator.name)
-    draw, limits = np.random.default_rng(options.seed).uniform, model.training_range
-    size = options.queries, model.n_joints
-    motion = np.stack([draw(limits[name]["min"], limits[name]["max"], size) for name in ("q", "dq", "ddq")], axis=1)
+    motion = _motion(model.training_range, options)
     with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as home:
         folder = Path(home)
         for name, text in c_files(model, ModelOrigin(options.folder.name, 1, 0, "")).items():
@@ -83,7 +82,7 @@ def run(options: Options, console: Console) -> Results:
         _do(["cc", "-std=c99", *options.flags, "-c", SOURCE, "-o", "model.o"], folder)
         results.sizes = {path.name: path.stat().st_size for path in sorted(folder.glob("*model.*"))}
         calls = str(options.calls)
-        for subject in ("nothing", "mean", "std"):
+        for subject in ("nothing", *(("state", "state_std") if model.remembers else ()), "mean", "std"):
             console.print(f"{subject}: {options.calls:,} calls", highlight=False)
             _do([str(folder / "timing"), subject, calls, "queries", "times", "answers"], folder)
             results.timings[subject] = Timing.of(np.fromfile(folder / "times", np.int64))
@@ -133,6 +132,16 @@ def targets(results: Results) -> list[Target]:
         Target("torque: largest relative deviation", tau, "", "≤", 1e-9),
         Target("standard deviation: the same", deviation, "", "≤", 1e-9),
     ]
+
+
+def _motion(limits: TrainingRange, options: Options) -> Array:
+    """Return q, dq and ddq of sinusoids through the training range at 1 kHz, (queries, 3, n)."""
+    (lowest, highest), speed = (np.array(limits["q"][end]) for end in ("min", "max")), np.array(limits["dq"]["max"])
+    size = 0.5 * (highest - lowest)
+    turn = speed / size * np.random.default_rng(options.seed).uniform(0.5, 1.0, len(size))
+    phase = 1e-3 * np.arange(options.queries)[:, None] * turn
+    q = lowest + size * (1 + np.sin(phase))
+    return np.stack([q, size * turn * np.cos(phase), -size * turn**2 * np.sin(phase)], axis=1)
 
 
 def _time_cpp(robot: Robot, options: Options, motion: Array, folder: Path) -> Timing:
