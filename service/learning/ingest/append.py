@@ -190,7 +190,10 @@ def follow_rows(
     """Return rows with the deflections that follow from the stream's earlier rows. In a `turn` of the model.
 
     The motion before late rows is unknown. source: row of the stream, None if it is new; sequence: of the first row.
+    Rows of models that remember nothing are logged without deflections, which earlier releases cannot read.
     """
+    if not served.model.remembers:
+        return FollowedRows(rows, None)
     late = source is not None and sequence <= source.last
     before = None if source is None or late else monitor.streams.get(stream_id).play
     state = PlayState.unknown(served.model.n_joints) if before is None else before

@@ -4,17 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from lipcore.kernels.drive.play import MAX_GAP_S, PlayState, element_widths
-from lipcore.online.batch import Rows
+from lipcore.online.batch import ARRAYS, Rows
 from lipcore.online.stream import StreamRecord
 from lipcore.vocabulary import CODES
 from service.journal import log
 from tests.service.learning.batches import make_rows
 from tests.service.learning.recordings import make_recording, read_logged_rows, send_batch, slice_recording
+from tests.system.remembering import save_model
 
 WIDTHS = element_widths(("revolute", "revolute"))
 BATCH = 20
+
+
+@pytest.fixture
+def learning_model(learning_service, tmp_path):
+    """Model with play elements."""
+    return replace(learning_service, trained=save_model(tmp_path / "remembering")).create_model()
 
 
 def follow_slowly(q):
@@ -78,6 +86,14 @@ def test_each_stream_has_its_own_deflections(learning_service, learning_model):
     send_batch(learning_model, 0, slice_recording(recorded, 0, BATCH))
     send_batch(learning_model, 0, slice_recording(recorded, BATCH, 2 * BATCH), stream_id="other")
     assert_follow(read_batch(learning_service, learning_model, 1), follow_slowly(recorded.q[BATCH:]))
+
+
+def test_rows_of_a_model_that_remembers_nothing_can_be_read_by_earlier_releases(learning_service):
+    learning_model = learning_service.create_model()
+    send_batch(learning_model, 0, slice_recording(make_recording(samples=BATCH), 0, BATCH))
+    rows = read_batch(learning_service, learning_model, 0)
+    assert rows.deflections is None
+    assert sorted(safetensors.numpy.load(log.encode(rows))) == sorted(ARRAYS)
 
 
 def test_state_survives_a_restart():
