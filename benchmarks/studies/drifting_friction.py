@@ -125,8 +125,9 @@ def _noisy(tau: Array, rng: np.random.Generator) -> Array:
 def rows_of(part: Part, widths: Array) -> Rows:
     """Return all rows with their weights."""
     samples = part.samples
-    rows = Rows(samples.t, samples.q, samples.dq, samples.ddq, part.tau, np.full(len(samples), Code.LEARNT, np.uint8))
-    return replace(rows, weight=stream_weights(samples.t), deflections=samples.deflections, widths=widths)
+    codes, weights = np.full(len(samples), Code.LEARNT, np.uint8), stream_weights(samples.t)
+    motion = samples.t, samples.q, samples.dq, samples.ddq
+    return Rows(*motion, part.tau, codes, weights, samples.deflections, widths)
 
 
 def body(model: TorqueModel) -> tuple[Array, Array]:

@@ -111,7 +111,8 @@ def learn(
         else:
             if around is not None and (mode == "fixed" or not begin or urdf):
                 begin = [around.geometry]
-            starts = [(each, noise.start(samples)[order]) for each in begin]
+            level = noise.start(samples)[order]
+            starts = [(each, level) for each in begin]
         polished = Pool(problem.recombined(OPTIONS.check_motions))
         for geometry, sigma in starts:
             polished.add(problem.descend(geometry, sigma, OPTIONS.polish_steps, watch.stop))

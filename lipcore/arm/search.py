@@ -191,8 +191,8 @@ def search(
     ranked = sorted(drawn, key=lambda each: _value(problem, each, wide))
     begin = [*known, *ranked[: OPTIONS.starts]]
 
-    def late() -> bool:
-        return time.thread_time() - began > seconds
+    def spent() -> float:
+        return time.thread_time() - began
 
     def descend(geometry: Geometry, sigma: Array) -> None:
         try:
@@ -204,12 +204,12 @@ def search(
         descend(geometry, wide)
         if step is not None:
             step(pool.best, 0.4 * (number + 1) / len(begin))
-        if late() and pool.points:
+        if spent() > seconds and pool.points:
             break
     if not pool.points:
         raise LinAlgError("the evidence cannot be computed at any start of the search")
     starts, hops, quiet = pool.descents, 0, 0
-    while not late() and quiet < (
+    while spent() <= seconds and quiet < (
         OPTIONS.max_idle_at_noise if _explained(pool.points[0], sensor_noise, problem.floor) else OPTIONS.max_idle
     ):
         before = pool.best
@@ -221,7 +221,7 @@ def search(
         hops += 1
         quiet = 0 if pool.best < before - OPTIONS.min_gain_nats else quiet + 1
         if step is not None:
-            step(pool.best, 0.4 + 0.6 * max(quiet / OPTIONS.max_idle, (time.thread_time() - began) / seconds))
+            step(pool.best, 0.4 + 0.6 * max(quiet / OPTIONS.max_idle, spent() / seconds))
     best = pool.points[0]
     return SearchResult(
         tuple(pool.points),
@@ -230,8 +230,8 @@ def search(
         pool.distinct,
         sum(1 for value in pool.ends if value < best.value + OPTIONS.same_nats),
         _explained(best, sensor_noise, problem.floor),
-        "time" if late() else "idle",
-        time.thread_time() - began,
+        "time" if spent() > seconds else "idle",
+        spent(),
     )
 
 

@@ -67,11 +67,11 @@ class Arrival(NamedTuple):
     leap: float | None = None
     """Seconds that the stream's clock has leapt ahead; None if it has not."""
     play: PlayState | None = None
-    """The deflections after its last row; None if later rows of the stream have arrived before."""
+    """The deflections after its last row; None if later rows of the stream came before, or the model has none."""
 
 
 class FollowedRows(NamedTuple):
-    """Rows with their deflections. play: those after the last row; None for late rows."""
+    """Rows with their deflections. play: those after the last row; None for late rows, and if the model has none."""
 
     rows: Rows
     play: PlayState | None
