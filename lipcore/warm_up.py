@@ -47,7 +47,7 @@ def warm_up(*names: str) -> None:
 
 def _swinging() -> Samples:
     """Return samples of two joints that swing under gravity, each at its own frequency."""
-    time, frequency = np.linspace(0.0, 10.0, 60), np.array([1.0, 1.7])
+    time, frequency = np.linspace(0.0, 30.0, 60), np.array([1.0, 1.7])
     phase = time[:, None] * frequency
     q, dq, ddq = np.sin(phase), np.cos(phase) * frequency, -np.sin(phase) * frequency**2
     tau = 3.0 * np.sin(np.cumsum(q, axis=1)) + ddq + 0.1 * dq

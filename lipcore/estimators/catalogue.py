@@ -21,8 +21,8 @@ from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel
-from lipcore.kernels.local import LocalKernel
 from lipcore.kernels.lse import LagrangianSEKernel
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.robots.urdf import JointMismatchError, RigidBody
 from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, JointType
 
@@ -65,7 +65,7 @@ ESTIMATORS: dict[str, Maker] = {
     "gip": lambda types, tied: {"torque": GeometricallyInspiredKernel(types)},
     "lse": lambda types, tied: {"torque": LagrangianSEKernel(types)},
     "rigid-body": lambda types, tied: {},
-    "rigid-body+local": lambda types, tied: {"local": LocalKernel(len(types))},
+    "rigid-body+local": lambda types, tied: {},
     "rigid-body+lip-chain": lambda types, tied: {"energy": _ResidualChainKernel(types)},
 }
 
@@ -75,17 +75,19 @@ def make_estimator(
     joint_types: Sequence[str],
     tied: bool = True,
     arm: Arm | None = None,
+    residual: ResidualKernel | None = None,
 ) -> Estimator:
     """Return an estimator for a robot. Raise UnknownEstimatorError with the valid names.
 
     arm: for ROBOT_ESTIMATORS, the learnt rigid bodies (`lipcore.arm.learning`). Raise ValueError if it is absent or
-    cannot be used, JointMismatchError if its joints are not those of the data.
+    cannot be used, JointMismatchError if its joints are not those of the data. residual: the local correction of
+    `rigid-body+local`.
     """
     if name not in ESTIMATORS:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
     types = check_joint_types(joint_types)
     drive = DriveKernel(Drive(len(types)) if arm is None else arm.friction)
-    terms = {**ESTIMATORS[name](types, tied), "friction": drive}
+    terms = {**ESTIMATORS[name](types, tied), **({} if residual is None else {"local": residual}), "friction": drive}
     if (name in ROBOT_ESTIMATORS) != (arm is not None):
         raise ValueError(f"estimator {name!r}: only {', '.join(ROBOT_ESTIMATORS)} need an arm, others must have none")
     if arm is None:

@@ -1,4 +1,4 @@
-"""The nonlinear term of a model as tables for C: `lipcore/export/c/energy.c.in` and `local.c.in`.
+"""The torque beside rigid bodies as tables for C: for `energy.c.in` and `residual.c.in`.
 
 Torques of such a term have the covariances c with m torques of inducing samples. They add αᵀ c to the mean and k₁ − |Q₁
 c|² to the variance. Q₂ c is added to the product of the weights' features and their deviations, see `CompactPosterior`.
@@ -16,7 +16,7 @@ from lipcore.data.samples import Array
 from lipcore.kernels.base import Params
 from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.fast.joints import read_rows
-from lipcore.kernels.local import LocalKernel, scaled
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.compact import CompactPosterior
 
 LANES = 4
@@ -27,8 +27,6 @@ LANES = 4
 class NonlinearTerm:
     """The contribution of a nonlinear term."""
 
-    template: str
-    """Template of its covariances."""
     tables: dict[str, Array]
     """Tables of the template, by name."""
     groups: int
@@ -51,16 +49,30 @@ class NonlinearTerm:
         n, count, outputs = term.n_joints, len(basis.outputs), basis.outputs
         used, number = np.unique(outputs // n, return_inverse=True)
         motion = basis.inducing[used]
-        if isinstance(term, ChainKernel):
-            template, tables = "energy.c", _energy(term, posterior.params, motion)
-        else:
-            assert isinstance(term, LocalKernel)
-            template, tables = "local.c", _local(posterior.params, motion)
+        assert isinstance(term, ChainKernel)
+        tables = _energy(term, posterior.params, motion)
         groups = len(tables["samples"])
-        places = np.full((groups * LANES if template == "energy.c" else groups, n), -1)
+        places = np.full((groups * LANES, n), -1)
         places[number, outputs % n] = np.arange(count)
         learnt = posterior.root[:count, :count]
-        return cls(template, tables, groups, places, posterior.weights[:count], learnt, posterior.std_factor)
+        return cls(tables, groups, places, posterior.weights[:count], learnt, posterior.std_factor)
+
+
+def correction_tables(residual: ResidualKernel) -> dict[str, Array | NDArray[np.int64]]:
+    """Return the tables of a local correction."""
+    joints = residual.joints
+    counts, rows = (
+        [len(each) for each in part] for part in zip(*((one.weights, one.root) for one in joints), strict=True)
+    )
+    return {
+        "rates": np.stack([1 / each.lengthscales for each in joints]),
+        "variance": residual.prior,
+        "starts": np.cumsum([0, *counts]),
+        "rows": np.array(rows),
+        "centres": np.concatenate([each.centres / each.lengthscales for each in joints]),
+        "weights": np.concatenate([each.weights for each in joints]),
+        "roots": np.concatenate([each.root[np.tril_indices(len(each.root))] for each in joints]),
+    }
 
 
 def _energy(term: ChainKernel, params: Params, motion: Motion) -> dict[str, Array]:
@@ -78,12 +90,3 @@ def _energy(term: ChainKernel, params: Params, motion: Motion) -> dict[str, Arra
     samples = padded.reshape(groups, LANES, *rows.shape[1:]).transpose(0, 2, 3, 1)
     shared = dict(zip(("constant", "cosine", "sine"), shares[0].T, strict=True))
     return {**shared, "scales": scales, "weights": np.tril(weights), "samples": samples}
-
-
-def _local(params: Params, motion: Motion) -> dict[str, Array]:
-    """Return the tables of a local term.
-
-    rate: (4 n,), one over the lengthscales; scales: (n,), variances; samples: (S, 4 n), in units of the lengthscales.
-    """
-    rate, scales = np.exp(-params["local.log_lengthscales"]), np.exp(params["local.log_scale"])
-    return {"rate": rate, "scales": scales, "samples": scaled(params, motion)}

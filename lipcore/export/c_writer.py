@@ -20,7 +20,7 @@ import numpy as np
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.export.c_rest import NonlinearTerm
+from lipcore.export.c_rest import NonlinearTerm, correction_tables
 from lipcore.export.c_weights import (
     LinearWeights,
     UnsupportedEstimatorError,
@@ -38,8 +38,10 @@ from lipcore.kernels.fast.drive import HARMONICS
 from lipcore.kernels.fast.play import CERTAIN_SHARE
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.body import Body
 from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.compact import CompactPosterior
 from lipcore.vocabulary import DRIVE_KINDS, ROBOT_ESTIMATORS
 
 SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
@@ -149,6 +151,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "share": share,
         "root": _braced(_panels(root)),
         **_rest(NonlinearTerm.of(posterior), shared),
+        **_correction(posterior),
         "misfit": _braced(misfit),
         "floor": _braced(posterior.floor),
         "range": _braced(np.array(limits)),
@@ -226,14 +229,29 @@ def _rest(rest: NonlinearTerm | None, shared: Array) -> dict[str, str]:
         "learnt": _braced(_panels(rest.factor * rest.learnt.T)),
         "shared": _braced(padded.reshape(-1, WIDE, padded.shape[1]).transpose(0, 2, 1).reshape(-1)),
         "factor": repr(rest.factor**2),
-        "term": _template(rest.template).substitute(tables, groups=str(rest.groups), places=places),
+        "term": _template("energy.c").substitute(tables, groups=str(rest.groups), places=places),
     }
+
+
+def _correction(posterior: CompactPosterior) -> dict[str, str]:
+    """Return the contribution of a local correction, empty if no joint is corrected."""
+    residual = posterior.basis.known
+    if not isinstance(residual, ResidualKernel) or not residual.prior.any():
+        return {"corrected": "0", "correction": ""}
+    tables = correction_tables(residual)
+    texts = {
+        name: _integers(values) if values.dtype == np.int64 else _braced(values) for name, values in tables.items()
+    }
+    most = str(max(1, int(tables["rows"].max())))
+    return {"corrected": "1", "correction": _template("residual.c").substitute(texts, most=most)}
 
 
 def _stack(model: TorqueModel) -> str:
     """Return the stack of a call in kB. It contains the links, and covariances and products of energies."""
     n, outputs = model.n_joints, len(model.posterior.basis.outputs)
-    return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0)))
+    residual = model.posterior.basis.known
+    rows = max(len(each.root) for each in residual.joints) if isinstance(residual, ResidualKernel) else 0
+    return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0) + 8e-3 * rows))
 
 
 def _panels(root: Array) -> Array:

@@ -33,8 +33,10 @@ from lipcore.files.manifest import (
     ModelFormatError,
     read_manifest_bytes,
 )
+from lipcore.files.residual import read_residual, residual_tensors
 from lipcore.files.tensors import FLOOR, INDUCING, MISFIT, OUTPUTS, PARAMS, A, B, read_tensors
 from lipcore.kernels.arm_prior import Arm
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.parameters import report
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import warnings
@@ -44,7 +46,7 @@ from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Statistics
 from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import GEOMETRY_MODES, ROBOT_ESTIMATORS
+from lipcore.vocabulary import GEOMETRY_MODES, LOCAL, ROBOT_ESTIMATORS
 
 
 def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -90,6 +92,8 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
         tensors[MISFIT] = model.posterior.misfit.packed()
     if model.arm is not None:
         tensors |= arm_tensors(model.arm)
+    if isinstance(basis.known, ResidualKernel):
+        tensors |= residual_tensors(basis.known)
     parameters = report(model.posterior, model.estimator, model.joint_names)
     payload = save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()})
     manifest = {
@@ -321,7 +325,12 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
     if arm is None and (strange := next(filter(is_arm_tensor, tensors), None)) is not None:
         raise ModelFormatError(f"{TENSORS} has the tensor {strange!r}, but the estimator has no rigid bodies", TENSORS)
     options, calibration = manifest["options"], Calibration(**manifest["calibration"])
-    estimator = make_estimator(manifest["estimator"], manifest["joint_types"], bool(options.get("tied", True)), arm)
+    residual = read_residual(tensors)
+    if (residual is None) == (manifest["estimator"] == LOCAL):
+        raise ModelFormatError(f"{TENSORS} must have the tensors of a local correction for {LOCAL} alone", TENSORS)
+    estimator = make_estimator(
+        manifest["estimator"], manifest["joint_types"], bool(options.get("tied", True)), arm, residual
+    )
     misfit = Misfit.unpacked(tensors[MISFIT]) if MISFIT in tensors else None
     if (misfit is not None and misfit.elements.size > 0) != (arm is not None and "play" in arm.drive):
         raise ModelFormatError(f"tensor {MISFIT!r} needs rows of play elements if friction has play", TENSORS)

@@ -11,6 +11,7 @@ from lipcore.data.motion import Array
 from lipcore.files import strict_json
 from lipcore.files.arm import is_arm_tensor
 from lipcore.files.manifest import TENSORS, Limits, ModelFormatError
+from lipcore.files.residual import COUNTS, NAMES, WEIGHTS, check_shapes
 from lipcore.files.strict_json import quote
 from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.kernels.fast.answer import MISFIT_ROWS
@@ -26,6 +27,8 @@ _MISFIT_ROWS = EARLIER_ROWS, MISFIT_ROWS, MISFIT_ROWS + 2 * len(ELEMENTS)
 """Rows of a misfit: of earlier releases, without and with play elements."""
 A, B, FLOOR, MISFIT = "statistics/a", "statistics/b", "floor", "misfit"
 PARAMS = "params/"
+WHOLE = OUTPUTS, COUNTS
+"""Tensors of whole numbers."""
 TYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "I64": np.dtype("<i8")}
 
 
@@ -57,7 +60,7 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
             value = tensors[name] = values.reshape(each.shape).copy()
         except ValueError as error:  # no elements, but lengths too large for an array
             raise _bad(f"tensor {quote(name)} cannot be read: {error}") from None
-        if name != OUTPUTS and not np.isfinite(value).all():
+        if name not in WHOLE and not np.isfinite(value).all():
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")
     if FLOOR in tensors and bool((tensors[FLOOR] < 0).any()):
         raise _bad(f"tensor {FLOOR!r} has a number below zero, expected variances")
@@ -111,7 +114,7 @@ def _entry(name: str, value: msgspec.Raw) -> Tensor:
         entry = strict_json.decode(_TENSOR, bytes(value), MAX_HEADER_BYTES)
     except strict_json.StrictJsonError as error:
         raise _bad(f"tensor {quote(name)}: {error}") from None
-    expected = "I64" if name == OUTPUTS else "F64"
+    expected = "I64" if name in WHOLE else "F64"
     if entry.dtype != expected:
         raise _bad(f"tensor {quote(name)} is of type {quote(entry.dtype)}, expected {expected}")
     begin, end = entry.data_offsets
@@ -129,11 +132,15 @@ def _check_sizes(entries: dict[str, Tensor], n: int, limits: Limits) -> None:
             B,
             FLOOR,
             MISFIT,
+            *NAMES,
         ):
             raise _bad(f"{TENSORS} has the tensor {quote(name)}, which this release does not know")
     for name in (OUTPUTS, *INDUCING, A, B):
         if name not in entries:
             raise _bad(f"{TENSORS} lacks the tensor {name!r}")
+    of_residual = {name: entries[name].shape for name in NAMES if name in entries}
+    if of_residual and (wrong := check_shapes(of_residual, n)) is not None:
+        raise _bad(f"{TENSORS} {wrong}")
     samples = entries["inducing/q"].shape[:1]
     for name in INDUCING:
         if entries[name].shape != (*samples, n) or not samples:
@@ -144,7 +151,8 @@ def _check_sizes(entries: dict[str, Tensor], n: int, limits: Limits) -> None:
     counts = {
         "inducing_samples": samples[0],
         "inducing_torques": samples[0] * n,
-        "inducing_outputs": max(outputs[0], b[0] - 64 * n),  # each linear term has a few weights a joint
+        # each linear term has a few weights a joint
+        "inducing_outputs": max(outputs[0], b[0] - 64 * n) + of_residual.get(WEIGHTS, (0,))[0],
     }
     for what, count in counts.items():
         if count > getattr(limits, what):

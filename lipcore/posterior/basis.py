@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.base import Cross, LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
+from lipcore.kernels.base import Cross, KnownTorque, LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
 from lipcore.posterior.linalg import block_diagonal, cholesky, solve_lower
 
 
@@ -32,6 +32,8 @@ class Basis:
     """Places of the chosen torques among the S n torques, sample by sample, (m,)."""
     root: Array
     """B, (M, M) lower triangular."""
+    known: KnownTorque | None = None
+    """Torque that the variables do not change, or None. Its variance is outside the basis."""
 
     @classmethod
     def build(cls, kernel: TorqueKernel, params: Params, inducing: Motion, outputs: Indices) -> Basis:
@@ -40,7 +42,7 @@ class Basis:
         params: hyperparameters; inducing: S samples; outputs: (m,), chosen torques, numbered as sample · n + joint.
         Raise ValueError if outputs and terms do not match.
         """
-        term, linear = split(kernel)
+        term, linear, known = split(kernel)
         places = len(inducing) * kernel.n_joints
         if outputs.ndim != 1 or len(np.unique(outputs)) != len(outputs) or (term is None and len(outputs)):
             raise ValueError(f"outputs has shape {outputs.shape}, expected (m,) distinct places of torques")
@@ -51,7 +53,7 @@ class Basis:
             gram = term.symmetric_gram(params, inducing)
             roots.insert(0, cholesky(gram[np.ix_(outputs, outputs)]).lower)
         # files store no deflections, on which only linear terms depend
-        return cls(term, linear, params, replace(inducing, deflections=None), outputs, block_diagonal(roots))
+        return cls(term, linear, params, replace(inducing, deflections=None), outputs, block_diagonal(roots), known)
 
     def __len__(self) -> int:
         return len(self.root)
@@ -76,10 +78,11 @@ class Basis:
         return self._open(self.prior(query), features)
 
     def prior(self, query: Motion) -> Array:
-        """Return the prior variance of the nonlinear term's torques at N queries, (N, n); zero without such a term."""
-        if self.term is None:
-            return np.zeros_like(query.q)
-        return np.ascontiguousarray(self.term.variance(self.params, query).diagonal(axis1=1, axis2=2))
+        """Return the variance of the nonlinear and the known torque at N queries, (N, n); zero without such terms."""
+        total = np.zeros_like(query.q) if self.known is None else self.known.moments(query)[1]
+        if self.term is not None:
+            total += self.term.variance(self.params, query).diagonal(axis1=1, axis2=2)
+        return total
 
     def features_and_uncovered(self, query: Motion) -> tuple[Array, Array]:
         """Return `features` (M, N n) and `uncovered` (N, n) of N queries.
@@ -129,12 +132,16 @@ class Basis:
         return np.asarray(np.maximum(prior - explained, 0.0))
 
 
-def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...]]:
-    """Return the nonlinear term of a kernel, or None, and its linear terms. Raise ValueError for any other kernel."""
+def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...], KnownTorque | None]:
+    """Return the nonlinear term of a kernel, its linear terms, and the known one, None where there is none.
+
+    Raise ValueError for any other kernel.
+    """
     terms: Sequence[TorqueKernel] = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
     nonlinear = [each for each in terms if isinstance(each, PairKernel)]
     linear = tuple(each for each in terms if isinstance(each, LinearKernel))
-    if len(nonlinear) > 1 or len(nonlinear) + len(linear) < len(terms):
+    known = [each for each in terms if isinstance(each, KnownTorque)]
+    if len(nonlinear) + len(known) > 1 or len(nonlinear) + len(linear) + len(known) < len(terms):
         names = ", ".join(type(each).__name__ for each in terms)
-        raise ValueError(f"the kernel's terms are {names}, expected at most one pair kernel beside linear ones")
-    return (nonlinear[0] if nonlinear else None), linear
+        raise ValueError(f"the kernel's terms are {names}, expected at most one other than linear ones")
+    return (nonlinear[0] if nonlinear else None), linear, (known[0] if known else None)

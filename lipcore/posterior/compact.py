@@ -10,7 +10,7 @@ import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.base import LinearKernel, Params, TorqueKernel, on_last_diagonal
-from lipcore.posterior.basis import Basis
+from lipcore.posterior.basis import Basis, split
 from lipcore.posterior.exact import Posterior, Prediction
 from lipcore.posterior.linalg import solve_lower, solve_lower_right
 from lipcore.posterior.misfit import Misfit
@@ -121,6 +121,17 @@ class CompactPosterior(Posterior):
         floor = np.zeros_like(noise_variance) if floor is None else floor
         misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
         return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor, misfit)
+
+    def corrected(self, kernel: TorqueKernel, noise_variance: Array) -> CompactPosterior:
+        """Return this posterior of the same variables beside a known torque.
+
+        kernel: with that torque; noise_variance: beside it, (n,) (N·m)². The misfit stays, for motion far from samples.
+        """
+        params = {**self.params, "noise.log_std": 0.5 * np.log(noise_variance)}
+        noise_variance = np.exp(2 * params["noise.log_std"])  # to the last bit as a file will be read
+        *_, known = split(kernel)
+        basis = replace(self.basis, params=params, known=known)
+        return replace(self, kernel=kernel, params=params, basis=basis, noise_variance=noise_variance)
 
     def row_variance(self, motion: Motion) -> Array:
         """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)², within the reach of the basis."""

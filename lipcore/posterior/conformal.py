@@ -46,6 +46,13 @@ class Conformal:
         if self.blocks < 1:
             raise ValueError(f"blocks is {self.blocks}, expected at least 1")
 
+    def replaced(self, joints: Sequence[int], other: Conformal) -> Conformal:
+        """Return these factors with those of some joints, numbered from 0, from `other`."""
+        mine = [zip(self.scale, self.guaranteed, strict=True), zip(other.scale, other.guaranteed, strict=True)]
+        pairs = [two if joint in joints else one for joint, (one, two) in enumerate(zip(*mine, strict=True))]
+        scale, guaranteed = zip(*pairs, strict=True)
+        return Conformal(scale, guaranteed, min(self.blocks, other.blocks))
+
     def widened(self, factors: Sequence[float]) -> Conformal:
         """Return these factors with the scales multiplied by `factors`, (n,), at least 1."""
         return replace(self, scale=tuple(np.multiply(self.scale, factors).tolist()))
@@ -60,7 +67,15 @@ def fit_conformal(posterior: CompactPosterior, samples: Samples, variance: Array
     order = np.lexsort((samples.t, samples.episode))
     ordered = samples.rows(order)
     starts = blocks(ordered)
-    score = scores(posterior, ordered, variance[order], starts)
+    return conformal_of(ordered, scores(posterior, ordered, variance[order], starts))
+
+
+def conformal_of(samples: Samples, score: Array) -> Conformal:
+    """Return the factors from the scores of N samples in order, (N, n): |error| / half width of the 95 % interval.
+
+    The scores are those of a model that has not seen the sample's block, of a second or a whole episode.
+    """
+    starts = blocks(samples)
     scale, guaranteed = _quantile(score, np.diff(starts, append=len(score)))
     return Conformal(scale, guaranteed, len(starts))
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.base import LinearKernel, PairKernel, Params
+from lipcore.kernels.base import KnownTorque, LinearKernel, PairKernel, Params
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.kernels.drive.terms import SIGN_WIDTH
@@ -40,11 +40,13 @@ class _Scratch(threading.local):
         self.std = np.zeros((queries, n))
         self.covariance = np.zeros((queries, n, n))
         self.share = np.zeros((queries, n))
+        self.known = np.zeros((2, queries, n))
         self.of_one = (
             self.motions,
             self.deflected,
             self.blocks,
             self.features,
+            self.known,
             self.covariance,
             self.memory,
             self.std,
@@ -63,7 +65,8 @@ class Evaluator:
     None without `term`. outputs: (m,), the chosen torques, as sample · n + joint. linear: the linear terms in the order
     of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,) (N·m)²;
     misfit: see `Misfit.packed`; None for no floor or misfit. usual: mean and variance of the torque in
-    training, (n,) each, if predictions may fall back.
+    training, (n,) each, if predictions may fall back. known: torque that the anchors do not change. Its mean is added
+    to the mean, its variance to the misfit.
 
     `one` and `many` return the mean of the posterior, which learning and external torque need. They also return the
     share of the fallback in the torque to send, which `fall_back` computes.
@@ -86,13 +89,17 @@ class Evaluator:
         floor: Array | None = None,
         misfit: Array | None = None,
         usual: tuple[Array, Array] | None = None,
+        known: KnownTorque | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
             raise ValueError("expected both term and inducing, or neither")
+        if term is not None and known is not None:
+            raise ValueError("term and known are both given, expected one of them")
         if term is None and not linear:
             raise ValueError("term is None and linear is empty, expected at least one term")
         self.n_joints = n = linear[0].n_joints if term is None else term.n_joints
         self._cross = None if term is None or inducing is None else term.cross(params, inducing)
+        self._known = known
         samples = 0 if self._cross is None else self._cross.size
         self._outputs = np.array(outputs, dtype=np.int64)
         means, variances = _linear_prior(linear, params)
@@ -155,7 +162,7 @@ class Evaluator:
         """
         scratch, what = self._one, STD if std or self._falls_back else MEAN
         # slicing would cost as much as the arithmetic
-        query, deflected, blocks, features, work, memory, own, share = scratch.of_one
+        query, deflected, blocks, features, known, work, memory, own, share = scratch.of_one
         if covariance is not None:
             work, what = covariance, COVARIANCE
         if len(motion) > POSITIONS:
@@ -163,6 +170,8 @@ class Evaluator:
         query[0] = motion
         if self._cross is not None:
             self._cross.fill_many(query, blocks)
+        if self._known is not None:
+            self._known.fill_many(query, known[0], known[1])
         for first, last, fill in self._fills:
             fill(query[0], features[0, first:last])
         tau = np.empty((1, self.n_joints))
@@ -172,6 +181,7 @@ class Evaluator:
             self._outputs,
             blocks,
             features,
+            known[1],
             self._std_factor,
             self._floor,
             self._misfit,
@@ -185,6 +195,8 @@ class Evaluator:
             work,
             share,
         )
+        if self._known is not None:
+            tau += known[0]
         return tau[0], deviation[0] if std else None, share[0].copy() if doubtful else None
 
     def many(
@@ -257,16 +269,19 @@ class Evaluator:
     ) -> bool:
         """Compute N queries. moving: their motion for friction and payload."""
         count = len(motions)
-        blocks, features = scratch.blocks[:count], scratch.features[:count]
+        blocks, features, known = scratch.blocks[:count], scratch.features[:count], scratch.known[:, :count]
         if self._cross is not None:
             self._cross.fill_many(motions, blocks)
+        if self._known is not None:
+            self._known.fill_many(motions, known[0], known[1])
         for first, fill_many, moves in self._fills_many:
             fill_many(moving if moves else motions, features, first)
-        return answer(
+        doubtful = answer(
             self._fixed,
             self._outputs,
             blocks,
             features,
+            known[1],
             self._std_factor,
             self._floor,
             self._misfit,
@@ -280,6 +295,9 @@ class Evaluator:
             covariance,
             share,
         )
+        if self._known is not None:
+            tau += known[0]
+        return doubtful
 
 
 def _linear_prior(linear: Sequence[LinearKernel], params: Params) -> tuple[Array, Array]:

@@ -10,13 +10,12 @@ import numpy as np
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators.hyperparameters import FitCancelledError
 from lipcore.estimators.options import FitOptions
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.linalg import unpack_symmetric
+from lipcore.posterior.linalg import cholesky, unpack_symmetric
 from lipcore.posterior.statistics import Statistics
 from lipcore.posterior.summing import CHUNK, Summing, Total
-from lipcore.training.correction import side_by_side
-from lipcore.vocabulary import LOCAL
 
 SHARD = 2048
 """Samples of one shard, which one worker sums up: about a second of one core for seven joints."""
@@ -85,14 +84,11 @@ def sum_samples(
 def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> TorqueModel:
     """Return the model with the posterior of `count` samples with these sums, instead of those of its fit.
 
-    Hyperparameters and basis do not change. Nor does a local correction, because the sums are those of the arm alone.
+    Hyperparameters and basis do not change. The sums are those of the arm beside a local correction. It gives back at
+    its centres what they change in the arm.
     """
     posterior = model.posterior
     statistics = Statistics(unpack_symmetric("a", sums.a), sums.b, sums.weight)
-    if model.estimator.name == LOCAL and posterior.statistics is not None:
-        known, first = posterior.statistics, len(posterior.basis.outputs)
-        correction = Statistics(known.a[:first, :first], known.b[:first], known.samples)
-        statistics = side_by_side(correction, Statistics(statistics.a[first:, first:], sums.b[first:], sums.weight))
     updated = CompactPosterior.build(
         posterior.kernel,
         posterior.basis,
@@ -105,7 +101,19 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
         name: {"min": sums.low[at].tolist(), "max": sums.high[at].tolist()}
         for at, name in enumerate(("q", "dq", "ddq"))
     }
-    return replace(model, posterior=updated, fit={**model.fit, "samples_posterior": count}, training_range=spans)
+    model = replace(model, fit={**model.fit, "samples_posterior": count}, training_range=spans)
+    if not isinstance(posterior.basis.known, ResidualKernel):
+        return replace(model, posterior=updated)
+    joints = list(posterior.basis.known.joints)
+    for joint, each in enumerate(joints):
+        if len(each.weights):
+            change = (updated.mean(each.motion) - posterior.mean(each.motion))[:, joint]
+            # learnt like the residual itself, beside the joint's noise
+            gram = each.gram + posterior.noise_variance[joint] / each.variance * np.eye(len(change))
+            joints[joint] = replace(each, weights=each.weights - cholesky(gram).solve(change))
+    estimator = replace(model.estimator, terms={**model.estimator.terms, "local": ResidualKernel(joints)})
+    updated = updated.corrected(estimator.kernel, updated.noise_variance)
+    return replace(model, estimator=estimator, posterior=updated)
 
 
 def condition(

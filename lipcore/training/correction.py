@@ -11,37 +11,44 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh
+from scipy.spatial.distance import cdist
 
+from lipcore.data.independence import recording_weights
+from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.samples import Array, Samples
-from lipcore.data.splits import GUARD_S, apply_guard
-from lipcore.kernels.base import TorqueKernel
-from lipcore.kernels.local import LocalKernel, nearness
-from lipcore.posterior.basis import Basis
+from lipcore.data.splits import GUARD_S, SplitRows, apply_guard
+from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.linalg import block_diagonal
-from lipcore.posterior.selection import pivots
-from lipcore.posterior.statistics import Statistics, collect
+from lipcore.posterior.conformal import Conformal, conformal_of
+from lipcore.posterior.linalg import add_diagonal, cholesky, solve_lower, solve_lower_right
+from lipcore.posterior.selection import Pivots, pivots
+from lipcore.posterior.statistics import learnt_root
+from lipcore.training import lengthscales
+from lipcore.training.lengthscales import Shape, fit_shapes
 
 
 @dataclass(frozen=True)
 class CorrectionOptions:
     """Evaluation of a correction, and its size."""
 
-    max_rows: int = 1000
+    max_rows: int = 3000
     """Max rows that are used."""
+    rows_each: float = 2.0
+    """Max rows for each effective sample (`data.independence`)."""
     blocks: int = 10
     """Blocks that are held out in turn."""
-    noise_shares: tuple[float, ...] = (1e-3, 1e-2, 0.1, 0.3, 1.0)
-    """Noise variances that are tried, as shares of the correction's variance."""
     min_gain: float = 0.2
     """Min gain of a corrected joint, as a share of its squared error."""
     min_gain_errors: float = 2.82
     """The same in standard errors: the 99 % point of t for ten blocks."""
-    max_outputs: int = 400
-    """Max torques at which the correction is stored."""
-    open_share: float = 0.01
-    """Max share of the correction's variance that these torques do not explain."""
+    sizes: tuple[int, ...] = (25, 50, 100, 200, 400, 800, 1500)
+    """Numbers of centres that are tried, the fewest first."""
+    min_progress: float = 0.02
+    """Min gain of the squared error from more centres than standard deviations use."""
+    std_centres: int = 200
+    """Max number of centres that standard deviations are computed from, because their cost grows with its square."""
+    open_share: float = 1e-4
+    """Max share of the correction's variance that the centres do not explain at the samples."""
 
 
 OPTIONS = CorrectionOptions()
@@ -53,11 +60,14 @@ REPORT_PREFIX = "local_"
 class Correction:
     """A correction and its gain."""
 
-    posterior: CompactPosterior
-    """Posterior of arm and correction."""
+    residual: ResidualKernel
+    noise: Array
+    """Variance of the noise beside it, (n,) (N·m)²."""
     errors: Array
     """Squared error of held-out blocks with the correction, divided by that without, (n,); 1 for joints without
     correction."""
+    conformal: Conformal | None
+    """Factors on the intervals of corrected joints, from held-out blocks; None if there are none."""
 
     def report(self) -> dict[str, float]:
         """Return the errors of corrected joints, for the manifest."""
@@ -69,70 +79,180 @@ def corrected_joints(report: Mapping[str, object]) -> list[int]:
     return [int(key.removeprefix(REPORT_PREFIX)) - 1 for key in report if key.startswith(REPORT_PREFIX)]
 
 
-def correct(kernel: TorqueKernel, arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ()) -> Correction:
-    """Return the posterior of an arm with a correction of its residuals of N samples.
+def correct(arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ()) -> Correction:
+    """Return a correction of an arm's residuals of N samples.
 
-    kernel: the arm's, friction and the local one; joints: joints to correct in any case, as an earlier fit did. The
-    noise of a corrected joint is its residual in held-out blocks. If the recording is too short for held-out blocks, no
-    joint is corrected.
+    joints: to correct in any case, as an earlier fit did. If the recording is too short for held-out blocks, no joint
+    is corrected.
     """
-    order = np.lexsort((samples.t, samples.episode))
-    samples = samples.rows(
-        order[np.unique(np.linspace(0, len(samples) - 1, OPTIONS.max_rows).round().astype(np.int64))]
-    )
-    motion, n = samples.motion(), samples.n_joints
-    left = samples.tau - arm.mean(motion)
-    local = LocalKernel(n)
-    own = local.initial(motion, left)
-    power, near = np.exp(own["local.log_scale"]), nearness(own, motion)
-    with_it, without = _errors(samples, left / np.sqrt(power), near)
-    best = with_it.mean(axis=0).argmin(axis=0)
-    gain = without - with_it[:, best, np.arange(n)]
-    error, chance = without.mean(axis=0), OPTIONS.min_gain_errors * gain.std(axis=0, ddof=1) / np.sqrt(len(gain))
-    corrected = (gain.mean(axis=0) > np.maximum(OPTIONS.min_gain * error, chance)) | np.isin(np.arange(n), joints)
-    errors = np.ones(n)
-    errors[corrected] = np.minimum(1 - gain.mean(axis=0)[corrected] / error[corrected], 1.0)
-    own["local.log_scale"] = np.log(np.where(corrected, 1.0, 1e-12) * power)
-    params = {**arm.params, **own, "noise.log_std": arm.params["noise.log_std"] + 0.5 * np.log(errors)}
-    kept = arm.basis.inducing
-    if corrected.any():
-        kept = motion[np.sort(pivots(near, 1, OPTIONS.max_outputs // int(corrected.sum()), OPTIONS.open_share).outputs)]
-    outputs = (np.arange(len(kept))[:, None] * n + np.flatnonzero(corrected)).reshape(-1)
-    taught = collect(Basis.build(local, own, kept, outputs), np.array(OPTIONS.noise_shares)[best] * power, motion, left)
-    assert arm.statistics is not None  # a trained posterior has statistics
-    posterior = CompactPosterior.build(
-        kernel,
-        Basis.build(kernel, params, kept, outputs),
-        side_by_side(taught, arm.statistics),
-        arm.noise_variance * errors,
-        arm.std_factor,
-        arm.misfit,
-    )
-    return Correction(posterior, errors)
+    ordered = samples.rows(np.lexsort((samples.t, samples.episode)))
+    count = min(OPTIONS.max_rows, OPTIONS.rows_each * float(_weights(ordered).sum()))
+    evenly = np.linspace(0, len(samples) - 1, max(2, round(count))).round().astype(np.int64)
+    used, n = ordered.rows(np.unique(evenly)), samples.n_joints
+    noise, errors, score = arm.noise_variance.copy(), np.ones(n), np.zeros(used.tau.shape)
+    found, blocks, conformal = [JointResidual.none(n)] * n, held_out_blocks(used), None
+    if blocks:
+        motion, weights = used.motion(), _weights(used)
+        inputs, known = residual_inputs(motion), arm.predict(motion)
+        left = used.tau - known.mean
+        block = np.repeat(np.arange(len(blocks)), [rows.stop - rows.start for rows, _ in blocks])
+        for j, shape in enumerate(fit_shapes(inputs, left, weights, block)):
+            if shape.gain < lengthscales.OPTIONS.min_gain_nats and j not in joints:
+                continue
+            fit = JointFit.of(inputs, left[:, j], weights, blocks, shape)
+            if fit.gains or j in joints:
+                found[j], noise[j] = fit.residual(inputs, float(noise[j]))
+                errors[j] = min(fit.error, 1.0)
+                mean, explained = fit.held_out
+                variance = found[j].variance - explained + noise[j] + known.covariance[:, j, j]
+                half = quantile(LEVEL) * np.sqrt(variance)
+                score[:, j] = np.abs(left[:, j] - mean) / half
+        conformal = conformal_of(used, score)
+    return Correction(ResidualKernel(found), noise, errors, conformal)
 
 
-def side_by_side(correction: Statistics, arm: Statistics) -> Statistics:
-    """Return the joint statistics of a correction and an arm that are independent."""
-    a, b = block_diagonal([correction.a, arm.a]), np.concatenate([correction.b, arm.b])
-    return Statistics(a, b, arm.samples)
+def _weights(samples: Samples) -> Array:
+    """Return the weights of samples in order, (N,). Rows of a thinned table are single episodes, so only t counts."""
+    course = np.cumsum(np.diff(samples.t, prepend=-np.inf) <= 0, dtype=np.int64)
+    return recording_weights(samples.t, course)
 
 
-def _errors(samples: Samples, left: Array, near: Array) -> tuple[Array, Array]:
-    """Return the mean squared errors of B blocks predicted from the others, with and without a correction.
-
-    With a correction they are (B, S, n) for S noise shares, without it (B, n). All are one if a block is too short.
-    samples: in order; left: (N, n), in units of its root mean square; near: (N, N).
-    """
-    block = np.arange(len(samples)) * OPTIONS.blocks // len(samples)
-    with_it, without = [], []
-    for each in range(OPTIONS.blocks):
-        parts = apply_guard(samples.episode, samples.t, np.arange(len(samples)), block == each, GUARD_S)
+def held_out_blocks(samples: Samples) -> list[tuple[slice, SplitRows]]:
+    """Return blocks of samples in order, each with the rows to train on and to test; none if one is too short."""
+    edges, out = np.linspace(0, len(samples), OPTIONS.blocks + 1).round().astype(np.int64), []
+    for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        held = np.zeros(len(samples), dtype=bool)
+        held[first:last] = True
+        parts = apply_guard(samples.episode, samples.t, np.arange(len(samples)), held, GUARD_S)
         if not (parts.train.any() and parts.held_out.any()):
-            return np.ones((2, len(OPTIONS.noise_shares), left.shape[1])), np.ones((2, left.shape[1]))
-        values, vectors = eigh(near[np.ix_(parts.train, parts.train)])
-        turned, across = vectors.T @ left[parts.train], near[np.ix_(parts.held_out, parts.train)] @ vectors
-        asked = left[parts.held_out]
-        answers = [across @ (turned / (values.clip(0.0) + share)[:, None]) for share in OPTIONS.noise_shares]
-        with_it.append([np.square(asked - answer).mean(axis=0) for answer in answers])
-        without.append(np.square(asked).mean(axis=0))
-    return np.array(with_it), np.array(without)
+            return []
+        out.append((slice(first, last), parts))
+    return out
+
+
+@dataclass(frozen=True)
+class KnownSums:
+    """Posterior of the m whitened variables of a Gaussian process g from N samples, y = g(x) + e.
+
+    It is `posterior.statistics` for one torque: R is the noise plus the variance s² − |φ|² outside the features φ.
+    """
+
+    features: Array
+    """φ, (N, m)."""
+    beyond: Array
+    """s² − |φ|², (N,)."""
+    weighed: Array
+    """R^-½ φ, (N, m)."""
+    right: Array
+    """R^-½ y, (N,)."""
+    a: Array
+    """Σ φ R⁻¹ φᵀ, (m, m)."""
+    b: Array
+    """Σ φ R⁻¹ y, (m,)."""
+
+    @classmethod
+    def of(cls, features: Array, variance: float, noise: Array, values: Array) -> KnownSums:
+        """Return the sums of N samples. features: φ, (N, m); variance: s²; noise: (N,); values: y, (N,)."""
+        beyond = np.maximum(variance - np.einsum("km,km->k", features, features), 0.0)
+        root = np.sqrt(1 / (noise + beyond))
+        weighed, right = features * root[:, None], values * root
+        return cls(features, beyond, weighed, right, weighed.T @ weighed, weighed.T @ right)
+
+    def predict(self, blocks: Sequence[tuple[slice, SplitRows]]) -> tuple[Array, Array]:
+        """Return mean and variance of g at all samples, (N,) each, each block from the samples of the others."""
+        mean, variance = np.empty((2, len(self.right)))
+        for block, parts in blocks:
+            left = self.weighed[~parts.train]
+            a = self.a - left.T @ left
+            add_diagonal(a, 1.0)
+            factor, features = cholesky(a), self.features[block]
+            mean[block] = features @ factor.solve(self.b - left.T @ self.right[~parts.train])
+            variance[block] = self.beyond[block] + np.square(factor.whiten(features.T)).sum(axis=0)
+        return mean, variance
+
+    def solve(self) -> tuple[Array, Array]:
+        """Return the mean of the variables, (m,), and the learnt root of their covariance, (m, m), from all samples."""
+        a = self.a.copy()
+        add_diagonal(a, 1.0)
+        factor = cholesky(a)
+        return factor.solve(self.b), learnt_root(factor.inverse())
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """Features of a joint's residual at N samples, and the errors of its blocks."""
+
+    order: Pivots
+    """Centres among the samples, with their correlations' Cholesky factor."""
+    shape: Shape
+    known: KnownSums
+    """Posterior from the chosen number of centres."""
+    few: KnownSums
+    """Posterior from at most `std_centres` of them."""
+    held_out: Array
+    """Mean and explained variance at all samples, each block from the others, (2, N)."""
+    gains: bool
+    """Whether this reduces the error beyond chance."""
+    error: float
+    """Squared error with the correction, divided by that without."""
+    stretch: float
+    """Mean square of the errors, divided by their variance."""
+
+    @classmethod
+    def of(
+        cls, inputs: Array, values: Array, weights: Array, blocks: Sequence[tuple[slice, SplitRows]], shape: Shape
+    ) -> JointFit:
+        """Return the features of N samples, and the errors of their blocks.
+
+        inputs: (N, 4 n); values: residuals, (N,) N·m; weights: of the samples, (N,); blocks: see `held_out_blocks`.
+        """
+        scaled = inputs / shape.lengthscales
+        order = pivots(np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean")), 1, OPTIONS.sizes[-1], OPTIONS.open_share)
+        features, noise = order.lower * np.sqrt(shape.variance), shape.noise / weights
+
+        def errors(predicted: Array | float) -> Array:
+            return np.array([np.mean(np.square(values - predicted)[parts.held_out]) for _, parts in blocks])
+
+        known = few = KnownSums.of(features[:, : OPTIONS.sizes[0]], shape.variance, noise, values)
+        predicted, variances = known.predict(blocks)
+        for size in OPTIONS.sizes[1:]:
+            if known.features.shape[1] == len(order):
+                break
+            larger = KnownSums.of(features[:, :size], shape.variance, noise, values)
+            mean, variance = larger.predict(blocks)
+            if (
+                size > OPTIONS.std_centres
+                and errors(mean).mean() > (1 - OPTIONS.min_progress) * errors(predicted).mean()
+            ):
+                break
+            known, predicted = larger, mean
+            if size <= OPTIONS.std_centres:
+                few, variances = larger, variance
+        without, with_it = errors(0.0), errors(predicted)
+        gain = without - with_it
+        chance = OPTIONS.min_gain_errors * gain.std(ddof=1) / np.sqrt(len(gain))
+        tested = np.any([parts.held_out for _, parts in blocks], axis=0)
+        stretch = float(np.mean((np.square(values - predicted) / (variances + shape.noise))[tested]))
+        error = float(with_it.mean() / without.mean()) if without.any() else 1.0
+        gains = bool(gain.mean() > max(OPTIONS.min_gain * without.mean(), chance))
+        held_out = np.stack([predicted, stretch * (shape.variance - variances)])
+        return cls(order, shape, known, few, held_out, gains, error, stretch)
+
+    def residual(self, inputs: Array, noise: float) -> tuple[JointResidual, float]:
+        """Return the residual, and the variance of the noise beside it. noise: variance of the arm's noise."""
+        count, scale = self.known.features.shape[1], np.sqrt(self.shape.variance)
+        root = self.order.lower[self.order.outputs[:count], :count]
+        mean, _ = self.known.solve()
+        _, learnt = self.few.solve()
+        few = len(learnt)
+        own = self.stretch * self.shape.noise
+        return (
+            JointResidual(
+                self.shape.lengthscales,
+                inputs[self.order.outputs[:count]],
+                scale * solve_lower(root, mean, transposed=True),
+                np.sqrt(self.stretch) * scale * solve_lower_right(learnt, root[:few, :few]),
+                max(self.stretch * self.shape.variance, noise - own),
+            ),
+            own,
+        )

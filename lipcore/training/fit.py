@@ -15,7 +15,7 @@ from lipcore.estimators.catalogue import Estimator, calibrate, check_estimator, 
 from lipcore.estimators.hyperparameters import FitProgress, fit
 from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
-from lipcore.kernels.base import Params, SumKernel
+from lipcore.kernels.base import Params
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import passing_friction
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
@@ -24,7 +24,7 @@ from lipcore.posterior.compression import Compression, build_linear, compress_sa
 from lipcore.posterior.conformal import Conformal, fit_conformal
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.statistics import collect
-from lipcore.training.correction import correct
+from lipcore.training.correction import Correction, correct, corrected_joints
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
 
@@ -51,22 +51,28 @@ def fit_estimator(
         learnt = learn(task, (*geometries, *installed))
     misfit = None if learnt is None else learnt.misfit
     learnt = learnt if name in ROBOT_ESTIMATORS else None
-    estimator = make_estimator(name, types, options.tied, None if learnt is None else learnt.arm)
+    plain = RIGID if name == LOCAL else name
+    estimator = make_estimator(plain, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(name)
     factor = calibration.function_std_factor
-    if learnt is not None and name in (RIGID, LOCAL):
+    if learnt is not None and plain == RIGID:
         report = {**learnt.report, "jitter": 0.0}
         used = samples.rows(learnt.rows)
         variance = np.exp(2 * learnt.params["noise.log_std"]) / learnt.counts
-        arm = SumKernel(*(term for kind, term in estimator.terms.items() if kind != "local"))
-        compression = build_linear(arm, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit)
+        compression = build_linear(
+            estimator.kernel, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit
+        )
+        conformal = fit_conformal(compression.posterior, used, variance)
         if name == LOCAL:
             if task.on_progress is not None:
                 task.on_progress(FitProgress("posterior", 0, 0, float(learnt.report["objective"]), 0.0, 0.0))
-            correction = correct(estimator.kernel, compression.posterior, samples, corrected)
-            compression = replace(compression, posterior=correction.posterior)
+            correction = correct(compression.posterior, samples, corrected)
             report |= correction.report()
-        conformal = fit_conformal(compression.posterior, used, variance)
+            estimator = _with_correction(estimator, correction)
+            posterior = compression.posterior.corrected(estimator.kernel, correction.noise)
+            compression = replace(compression, posterior=posterior)
+            if correction.conformal is not None:
+                conformal = conformal.replaced(corrected_joints(report), correction.conformal)
     else:
         # the start excludes the noise: what rigid bodies leave unexplained belongs to the other term
         params = {} if learnt is None else learnt.params
@@ -103,6 +109,11 @@ def fit_estimator(
         calibration=calibration,
         conformal=conformal,
     )
+
+
+def _with_correction(estimator: Estimator, correction: Correction) -> Estimator:
+    arm, friction = estimator.terms["rigid_body"], estimator.terms["friction"]
+    return Estimator(LOCAL, {"rigid_body": arm, "local": correction.residual, "friction": friction})
 
 
 def compact(

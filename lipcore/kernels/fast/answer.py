@@ -88,6 +88,7 @@ def answer(
     outputs: Indices,
     blocks: Array,
     features: Array,
+    beyond: Array,
     std_factor: float,
     floor: Array,
     misfit: Array,
@@ -109,6 +110,7 @@ def answer(
       panels of the rows that are added, one for each linear weight;
     - blocks: (N, S + 1, n, n), from `Cross`;
     - features: (N, P, n), Φᵀ;
+    - beyond: (N, n), variance of a torque that the anchors do not change; no reason for the fallback;
     - floor: (n,), min variance, at least 0;
     - misfit: (6 + 2 K, n), see `Misfit.packed`: variance at rest, the speed at which it has decayed to exp(−1),
       variance of faster motion, the usual speed and acceleration, variance at standstill, torque and widths of the play
@@ -154,7 +156,7 @@ def answer(
             any_share |= share[query, j] > 0.0
             more = misfit[0, j] * np.exp(-((motions[query, 1, j] / misfit[1, j]) ** 2)) + misfit[2, j] * faster
             more += misfit[5, j] * np.exp(-((motions[query, 1, j] / sign_width) ** 2))
-            more += _of_elements(misfit, motions[query], j)
+            more += _of_elements(misfit, motions[query], j) + beyond[query, j]
             covariance[query, j, j] = max(covariance[query, j, j] + more, floor[j])
             std[query, j] = np.sqrt(covariance[query, j, j])
     return any_share
@@ -177,6 +179,7 @@ def answer_one(
     outputs: Indices,
     blocks: Array,
     features: Array,
+    beyond: Array,
     std_factor: float,
     floor: Array,
     misfit: Array,
@@ -196,6 +199,7 @@ def answer_one(
         outputs,
         blocks,
         features,
+        beyond,
         std_factor,
         floor,
         misfit,

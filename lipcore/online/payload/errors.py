@@ -17,14 +17,16 @@ LIKE = 0.3, 0.3
 def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
     """Return the variance of the torques at N instants in three parts, (N·m)².
 
-    The parts are independent noise of every row, (n,); lasting errors and those of faster motion, (N, n); and errors of
-    joints at rest, (N, n), which may break away at any time.
+    The parts are independent noise of every row, (n,); lasting errors, also of faster motion and of a local correction,
+    (N, n); and errors of joints at rest, (N, n), which may break away at any time.
     """
     posterior = carrier.model.posterior
     noise, misfit = posterior.noise_variance, posterior.misfit
     white = np.maximum(noise - misfit.lasting, 1e-3 * noise)
     rest = misfit.at_rest(motion)
-    return white, (misfit.lasting + misfit.variance(motion) - rest), rest
+    lasting = misfit.lasting + misfit.variance(motion) - rest
+    known = posterior.basis.known
+    return white, lasting if known is None else lasting + known.moments(motion)[1], rest
 
 
 def likeness(carrier: Carrier, q: Array, dq: Array, speed: float, pose: float) -> Array:

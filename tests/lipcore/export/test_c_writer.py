@@ -121,7 +121,10 @@ def evaluate_exactly(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray
         inducing = inducing.reshape(first, len(query), n).transpose(1, 2, 0)
         cross = np.concatenate([fraction(inducing), cross], axis=2)
         before = PairKernel.variance(basis.term, posterior.params, query).diagonal(axis1=1, axis2=2)
-    tau = (cross @ fraction(posterior.weights) + fraction(features) @ fraction(centre)).astype(float)
+    known = np.zeros(query.q.shape)
+    if basis.known is not None:
+        known, before = basis.known.moments(query)
+    tau = (cross @ fraction(posterior.weights) + fraction(features) @ fraction(centre)).astype(float) + known
     squares = (cross @ fraction(posterior.root).T) ** 2
     variance = fraction(before) - squares[..., :first].sum(2) + squares[..., first:].sum(2)
     variance = variance.astype(float) * posterior.std_factor**2 + posterior.misfit.variance(query)

@@ -24,7 +24,6 @@ from lipcore.kernels.fast.lanes import LANES
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel
-from lipcore.kernels.local import LocalKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.newton_euler import rigid_body_torque
@@ -187,7 +186,6 @@ CASES: dict[str, Callable[[Sequence[str]], Case]] = {
     "se": lambda joint_types: Case(SquaredExponentialKernel(len(joint_types))),
     "gip": lambda joint_types: Case(GeometricallyInspiredKernel(joint_types)),
     "lse": lambda joint_types: Case(LagrangianSEKernel(joint_types)),
-    "local": lambda joint_types: Case(LocalKernel(len(joint_types))),
     "friction": friction_case,
     "friction of slow joints": partial(friction_case, kinds=("stribeck",)),
     "friction that is not linear in speed": partial(friction_case, kinds=("speed", "sides")),

@@ -1,20 +1,20 @@
 """Tests of the local correction: its kernel, where it is learnt, and that the arm stays unchanged."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
-from lipcore import FitOptions, Samples, TorquePrediction, train
-from lipcore.data.motion import Motion
+from lipcore import FitOptions, Samples, TorquePrediction, load, save, train
 from lipcore.estimators.task import Task
-from lipcore.kernels.local import LocalKernel
+from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
 from lipcore.model.selection import selection
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
-from lipcore.training.correction import corrected_joints
+from lipcore.training.correction import JointFit, corrected_joints, held_out_blocks
+from lipcore.training.lengthscales import Shape
 from lipcore.training.refit import refit, widen_intervals
 from lipcore.training.train import fit_model
 
@@ -61,18 +61,6 @@ def local_and_arm():
     return train_corrected(samples), train_corrected(samples, "rigid-body")
 
 
-def test_kernel_matches_its_docstring():
-    rng, n = np.random.default_rng(0), 2
-    x, y = (Motion(*rng.normal(0, 0.1, (3, rows, n))) for rows in (4, 3))
-    params = {"local.log_scale": rng.normal(size=n), "local.log_lengthscales": rng.normal(size=4 * n)}
-    inputs = [np.concatenate([each.q, each.dq, each.ddq, np.tanh(each.dq / 0.02)], axis=1) for each in (x, y)]
-    lengths, expected = np.exp(params["local.log_lengthscales"]), np.zeros((4, n, 3, n))
-    for k, m, i in np.ndindex(4, 3, n):
-        distance = sum((inputs[0][k, d] - inputs[1][m, d]) ** 2 / lengths[d] ** 2 for d in range(4 * n))
-        expected[k, i, m, i] = math.exp(params["local.log_scale"][i] - 0.5 * distance)
-    np.testing.assert_allclose(LocalKernel(n).gram(params, x, y), expected.reshape(4 * n, 3 * n), rtol=1e-12)
-
-
 @pytest.mark.slow
 def test_repeated_error_is_corrected_only_where_seen(local_and_arm):
     fit = local_and_arm[0].fit
@@ -83,11 +71,42 @@ def test_repeated_error_is_corrected_only_where_seen(local_and_arm):
     others = np.arange(3) != RIPPLED_JOINT
     assert corrected[others] == pytest.approx(uncorrected[others], rel=1e-6)
     far = simulate_ripple(8.0, start=3.0)
-    far = replace(far, q=far.q + 1.5, dq=-far.dq)
+    far = replace(far, q=far.q + 4.0, dq=-far.dq)
     found, expected = (predict(each, far) for each in local_and_arm)
     np.testing.assert_allclose(found.tau, expected.tau, rtol=0, atol=1e-6)
     spread, other = (np.hypot(each.tau_std, each.noise_std) for each in (found, expected))
     assert (spread > 0.98 * other).all()
+
+
+def test_saved_correction_predicts_the_same(local_and_arm, tmp_path):
+    save(local_and_arm[0], tmp_path / "model")
+    again, samples = load(tmp_path / "model"), simulate_ripple(8.0, start=100.0)
+    for before, after in zip(
+        predict(local_and_arm[0], samples).interval, predict(again, samples).interval, strict=True
+    ):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_correction_of_one_joint_is_that_of_a_dense_gaussian_process():
+    samples = simulate_ripple(15.0)
+    inputs, values = residual_inputs(samples.motion()), np.sin(5 * samples.q[:, 0])
+    weights = np.random.default_rng(0).uniform(0.3, 1.0, len(values))
+    shape = Shape(np.full(12, 1.5), 0.8, 0.02, 100.0)
+    fit = JointFit.of(inputs, values, weights, held_out_blocks(samples), shape)
+    joint, noise = fit.residual(inputs, 0.0)
+    queries = simulate_ripple(4.0, start=17.0).motion()
+    gram, cross = (
+        0.8 * np.exp(-0.5 * cdist(each / 1.5, inputs / 1.5, "sqeuclidean"))
+        for each in (inputs, residual_inputs(queries))
+    )
+    noisy = gram + np.diag(0.02 / weights)
+    none = JointResidual.none(3)
+    mean, variance = ResidualKernel([joint, none, none]).moments(queries)
+    expected = cross @ np.linalg.solve(noisy, values)
+    np.testing.assert_allclose(mean[:, 0], expected, atol=2e-3)  # OPTIONS.open_share of the variance is left out
+    left = 0.8 - np.einsum("ij,ji->i", cross, np.linalg.solve(noisy, cross.T))
+    np.testing.assert_allclose(variance[:, 0], fit.stretch * left, atol=2e-3 * fit.stretch)
+    assert noise == pytest.approx(fit.stretch * 0.02)
 
 
 def test_corrected_intervals_keep_their_coverage(local_and_arm):
@@ -97,15 +116,17 @@ def test_corrected_intervals_keep_their_coverage(local_and_arm):
 
 def test_correction_leaves_the_arm_unchanged(local_and_arm):
     local, arm = (each.posterior for each in local_and_arm)
-    np.testing.assert_allclose(local.weights[len(local.basis.outputs) :], arm.weights, rtol=1e-6)
+    np.testing.assert_allclose(local.weights, arm.weights, rtol=1e-6)
 
 
 @pytest.mark.slow
-def test_pass_over_all_rows_changes_only_the_arm(local_and_arm):
+def test_pass_over_all_rows_leaves_corrected_torque_as_it_is(local_and_arm):
     again, (chosen, arm) = simulate_ripple(8.0, start=100.0, seed=1), local_and_arm
     local = train_corrected(simulate_ripple(), statistics="all")
-    outputs = len(local.posterior.basis.outputs)
-    np.testing.assert_allclose(local.posterior.weights[:outputs], chosen.posterior.weights[:outputs], rtol=1e-6)
+    assert np.abs(local.posterior.weights - chosen.posterior.weights).max() > 1e-9
+    motion = chosen.posterior.basis.known.joints[RIPPLED_JOINT].motion
+    before, after = (each.posterior.mean(motion)[:, RIPPLED_JOINT] for each in (chosen, local))
+    np.testing.assert_allclose(after, before, atol=2e-4)  # the ripple is a hundred times as large
     assert rmse_per_joint(local, again)[RIPPLED_JOINT] < 0.3 * rmse_per_joint(arm, again)[RIPPLED_JOINT]
 
 

@@ -1,0 +1,115 @@
+"""Compiled mean and variance of the torque that training has learnt beside the arm (see `ResidualKernel`).
+
+Centres are stored LANES at a time, rows of roots PANEL Lanes at a time, column by column up to the diagonal.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.kernels.fast.compile import compiled, inlined
+from lipcore.kernels.fast.joints import Array
+from lipcore.kernels.fast.lanes import LANES, spread
+from lipcore.kernels.fast.views import lay
+
+Indices = NDArray[np.int64]
+
+PANEL = 4
+"""Lanes of rows in a panel of the root."""
+FAR = 160.0
+"""Squared distance, in lengthscales, from which on the correlation is constant: exp(−80)."""
+
+
+def pack_centres(centres: Array) -> Array:
+    """Return centres, (m, D), with the last repeated to fill the Lanes: (G, D, LANES), flat."""
+    padded = np.pad(centres, ((0, -len(centres) % LANES), (0, 0)), mode="edge" if len(centres) else "constant")
+    return padded.reshape(-1, LANES, centres.shape[1]).transpose(0, 2, 1).reshape(-1)
+
+
+def pack_root(root: Array) -> Array:
+    """Return the panels of a lower triangular matrix, (k, k), flat. Zeros fill the last panel."""
+    panels = [np.zeros(0)]
+    for first in range(0, len(root), PANEL * LANES):
+        rows = root[first : first + PANEL * LANES, : first + PANEL * LANES]
+        panels.append(np.pad(rows, ((0, PANEL * LANES - len(rows)), (0, 0))).T.reshape(-1))
+    return np.concatenate(panels)
+
+
+@compiled
+def residual_torque(
+    rates: Array,
+    centres: Array,
+    starts: Indices,
+    weights: Array,
+    roots: Array,
+    sizes: Indices,
+    prior: Array,
+    sign_width: float,
+    motions: Array,
+    mean: Array,
+    variance: Array,
+) -> None:
+    """Write the mean torques of N queries and their variances, (N, n) each.
+
+    rates: (n, 4 n), one over each joint's lengthscales; centres: of all joints, as of `pack_centres`, in units of them;
+    starts: (n + 1,), where they begin, in Lanes; weights: of all joints, N·m, with zeros to fill the Lanes; roots: of
+    all joints, as of `pack_root`; sizes: (n,), their numbers of rows; prior: (n,), variance without data; motions:
+    (N, …, n).
+    """
+    n = prior.shape[0]
+    x, near = np.empty(4 * n), np.empty(LANES * max(1, np.max(starts[1:] - starts[:-1])))
+    learnt = np.empty(PANEL * LANES)
+    for query in range(motions.shape[0]):
+        panel = 0
+        for joint in range(n):
+            for other in range(n):
+                for part in range(3):
+                    x[part * n + other] = motions[query, part, other] * rates[joint, part * n + other]
+                x[3 * n + other] = np.tanh(motions[query, 1, other] / sign_width) * rates[joint, 3 * n + other]
+            first, groups = starts[joint], starts[joint + 1] - starts[joint]
+            _correlate(centres, first * 4 * n * LANES, x, groups, near)
+            torque = 0.0
+            for centre in range(groups * LANES):
+                torque += weights[first * LANES + centre] * near[centre]
+            explained = 0.0
+            for row in range(0, sizes[joint], PANEL * LANES):
+                columns = min(row + PANEL * LANES, sizes[joint])
+                _multiply(roots, panel, near, columns, learnt)
+                for at in range(PANEL * LANES):
+                    explained += learnt[at] * learnt[at]
+                panel += columns * PANEL * LANES
+            mean[query, joint] = torque
+            variance[query, joint] = max(prior[joint] - explained, 0.0)
+
+
+@inlined
+def _correlate(centres: Array, at: int, x: Array, groups: int, near: Array) -> None:
+    """Write exp(−½ |x − z|²) for the centres z of `groups` Lanes, stored from `at` on."""
+    size = x.shape[0]
+    (places,), (out,) = lay(centres, at, ((groups, size),))[0], lay(near, 0, ((groups,),))[0]
+    for group in range(groups):
+        one, two, three, four = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
+        for d in range(0, size, 4):
+            a, b = places[group, d] - x[d], places[group, d + 1] - x[d + 1]
+            e, f = places[group, d + 2] - x[d + 2], places[group, d + 3] - x[d + 3]
+            one, two, three, four = one + a * a, two + b * b, three + e * e, four + f * f
+        out[group] = (one + two) + (three + four)
+    for centre in range(groups * LANES):
+        # Taylor series of exp(−t / 4096), twelve times squared: without calls, the loop is compiled to SIMD
+        t = min(near[centre], FAR) / 8192.0
+        value = 1 - t * (1 - t / 2 * (1 - t / 3 * (1 - t / 4 * (1 - t / 5 * (1 - t / 6)))))
+        for _ in range(12):
+            value *= value
+        near[centre] = value
+
+
+@inlined
+def _multiply(roots: Array, panel: int, near: Array, columns: int, out: Array) -> None:
+    """Write the product of the panel that begins at `panel` with the first `columns` numbers of `near`."""
+    (rows,), (y,) = lay(roots, panel, ((columns, PANEL),))[0], lay(out, 0, ((PANEL,),))[0]
+    a = b = c = d = spread(0.0)
+    for k in range(columns):
+        factor = near[k]
+        a, b, c, d = a + rows[k, 0] * factor, b + rows[k, 1] * factor, c + rows[k, 2] * factor, d + rows[k, 3] * factor
+    y[0], y[1], y[2], y[3] = a, b, c, d

@@ -1,0 +1,105 @@
+"""The torque that training has learnt beside the arm: near its motion only, and the same until the next training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from lipcore.data.motion import Array, Motion
+from lipcore.kernels.base import KnownTorque, Params
+from lipcore.kernels.drive.terms import SIGN_WIDTH
+from lipcore.kernels.fast.lanes import LANES
+from lipcore.kernels.fast.residual import pack_centres, pack_root, residual_torque
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class JointResidual:
+    """What is known of the residual of one joint, with r_c(x) = exp(−½ Σ_d (x_d − z_cd)² / ℓ_d²) at m centres z_c.
+
+    The mean is Σ_c weights_c r_c(x), the variance is variance − |root (r_1, …, r_k)|².
+    """
+
+    lengthscales: Array
+    """ℓ, (4 n,), in the units of `inputs`."""
+    centres: Array
+    """z, (m, 4 n)."""
+    weights: Array
+    """(m,) N·m."""
+    root: Array
+    """Lower triangular, (k, k) N·m, of the first k centres."""
+    variance: float
+    """Variance far from all centres, (N·m)²."""
+
+    @classmethod
+    def none(cls, n: int) -> JointResidual:
+        """Return a residual of zero, for one of n joints."""
+        return cls(np.ones(4 * n), np.zeros((0, 4 * n)), np.zeros(0), np.zeros((0, 0)), 0.0)
+
+    @property
+    def motion(self) -> Motion:
+        """The motion at the centres."""
+        return Motion(*np.ascontiguousarray(np.split(self.centres, 4, axis=1)[:3]))
+
+    @property
+    def gram(self) -> Array:
+        """Correlations r of all centres with each other, (m, m)."""
+        return _near(self.centres, self.centres, self.lengthscales)
+
+
+class ResidualKernel(KnownTorque):
+    """Torque of mean and variance as of its `JointResidual` in each joint; joints are independent.
+
+    Example: with one centre at rest and no uncertainty left there.
+
+    >>> joint = JointResidual(np.ones(4), np.zeros((1, 4)), np.array([2.0]), np.array([[0.5]]), 0.25)
+    >>> rest, far = Motion(*np.zeros((3, 1, 1))), Motion(np.full((1, 1), 10.0), *np.zeros((2, 1, 1)))
+    >>> kernel = ResidualKernel([joint])
+    >>> [(float(kernel.mean(x)[0, 0].round(6)), float(kernel.variance({}, x)[0, 0, 0])) for x in (rest, far)]
+    [(2.0, 0.0), (0.0, 0.25)]
+    """
+
+    def __init__(self, joints: list[JointResidual]) -> None:
+        self.n_joints, self.joints = len(joints), joints
+        padded = [np.pad(each.weights, (0, -len(each.weights) % LANES)) for each in joints]
+        self._arrays = (
+            np.stack([1 / each.lengthscales for each in joints]),
+            np.concatenate([pack_centres(each.centres / each.lengthscales) for each in joints]),
+            np.cumsum([0, *(len(each) // LANES for each in padded)]).astype(np.int64),
+            np.concatenate(padded),
+            np.concatenate([pack_root(each.root) for each in joints]),
+            np.array([len(each.root) for each in joints], np.int64),
+            self.prior,
+            SIGN_WIDTH,
+        )
+
+    @property
+    def prior(self) -> Array:
+        """Variance of the torques far from the training's motion, (n,) (N·m)²."""
+        return np.array([each.variance for each in self.joints])
+
+    def fill_many(self, motions: Array, mean: Array, variance: Array) -> None:
+        """Write the means and variances of N queries; see `KnownTorque.fill_many`."""
+        residual_torque(*self._arrays, motions, mean, variance)
+
+    def gram(self, params: Params, x: Motion, y: Motion) -> Array:
+        """Return the covariance of all torques of x with those of y, (N n, M n)."""
+        n, one, other = self.n_joints, residual_inputs(x), residual_inputs(y)
+        out = np.zeros((len(x), n, len(y), n))
+        for j, each in enumerate(self.joints):
+            learnt = [each.root @ _near(each.centres[: len(each.root)], at, each.lengthscales) for at in (one, other)]
+            out[:, j, :, j] = each.variance * _near(one, other, each.lengthscales) - learnt[0].T @ learnt[1]
+        return out.reshape(len(x) * n, len(y) * n)
+
+
+def residual_inputs(motion: Motion) -> Array:
+    """Return x = (q, dq, ddq, tanh(dq / SIGN_WIDTH)) of N instants, (N, 4 n)."""
+    return np.concatenate([motion.q, motion.dq, motion.ddq, np.tanh(motion.dq / SIGN_WIDTH)], axis=1)
+
+
+def _near(one: Array, other: Array, lengthscales: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * cdist(one / lengthscales, other / lengthscales, "sqeuclidean")))
