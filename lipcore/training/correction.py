@@ -20,7 +20,7 @@ from lipcore.data.splits import GUARD_S, SplitRows, apply_guard
 from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.conformal import Conformal, conformal_of
-from lipcore.posterior.linalg import add_diagonal, cholesky, solve_lower, solve_lower_right
+from lipcore.posterior.linalg import Factor, add_diagonal, cholesky, solve_lower, solve_lower_right
 from lipcore.posterior.selection import Pivots, pivots
 from lipcore.posterior.statistics import learnt_root
 from lipcore.training import lengthscales
@@ -170,12 +170,18 @@ class KnownSums:
             variance[block] = self.beyond[block] + np.square(factor.whiten(features.T)).sum(axis=0)
         return mean, variance
 
-    def solve(self) -> tuple[Array, Array]:
-        """Return the mean of the variables, (m,), and the learnt root of their covariance, (m, m), from all samples."""
+    def mean(self) -> Array:
+        """Return the mean of the variables from all samples, (m,)."""
+        return self._factor().solve(self.b)
+
+    def learnt(self) -> Array:
+        """Return the learnt root of their covariance from all samples, (m, m)."""
+        return learnt_root(self._factor().inverse())
+
+    def _factor(self) -> Factor:
         a = self.a.copy()
         add_diagonal(a, 1.0)
-        factor = cholesky(a)
-        return factor.solve(self.b), learnt_root(factor.inverse())
+        return cholesky(a)
 
 
 @dataclass(frozen=True)
@@ -196,7 +202,7 @@ class JointFit:
     error: float
     """Squared error with the correction, divided by that without."""
     stretch: float
-    """Mean square of the errors, divided by their variance."""
+    """Mean square of the errors, divided by their variance; at least 0.01."""
 
     @classmethod
     def of(
@@ -232,7 +238,7 @@ class JointFit:
         gain = without - with_it
         chance = OPTIONS.min_gain_errors * gain.std(ddof=1) / np.sqrt(len(gain))
         tested = np.any([parts.held_out for _, parts in blocks], axis=0)
-        stretch = float(np.mean((np.square(values - predicted) / (variances + shape.noise))[tested]))
+        stretch = max(0.01, float(np.mean((np.square(values - predicted) / (variances + shape.noise))[tested])))
         error = float(with_it.mean() / without.mean()) if without.any() else 1.0
         gains = bool(gain.mean() > max(OPTIONS.min_gain * without.mean(), chance))
         held_out = np.stack([predicted, stretch * (shape.variance - variances)])
@@ -242,8 +248,7 @@ class JointFit:
         """Return the residual, and the variance of the noise beside it. noise: variance of the arm's noise."""
         count, scale = self.known.features.shape[1], np.sqrt(self.shape.variance)
         root = self.order.lower[self.order.outputs[:count], :count]
-        mean, _ = self.known.solve()
-        _, learnt = self.few.solve()
+        mean, learnt = self.known.mean(), self.few.learnt()
         few = len(learnt)
         own = self.stretch * self.shape.noise
         return (
