@@ -24,7 +24,7 @@ from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.residual import ResidualKernel
 from lipcore.robots.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, LOCAL, ROBOT_ESTIMATORS, JointType
 
 
 class UnknownEstimatorError(ValueError):
@@ -46,6 +46,11 @@ class Estimator:
     def kernel(self) -> TorqueKernel:
         """Sum of the terms, the prior of the measured torque without noise."""
         return SumKernel(*self.terms.values())
+
+    def corrected(self, residual: ResidualKernel) -> Estimator:
+        """Return the arm of this estimator with a local correction."""
+        arm, friction = self.terms["rigid_body"], self.terms["friction"]
+        return Estimator(LOCAL, {"rigid_body": arm, "local": residual, "friction": friction})
 
 
 class _ResidualChainKernel(ChainKernel):
@@ -75,19 +80,17 @@ def make_estimator(
     joint_types: Sequence[str],
     tied: bool = True,
     arm: Arm | None = None,
-    residual: ResidualKernel | None = None,
 ) -> Estimator:
     """Return an estimator for a robot. Raise UnknownEstimatorError with the valid names.
 
     arm: for ROBOT_ESTIMATORS, the learnt rigid bodies (`lipcore.arm.learning`). Raise ValueError if it is absent or
-    cannot be used, JointMismatchError if its joints are not those of the data. residual: the local correction of
-    `rigid-body+local`.
+    cannot be used, JointMismatchError if its joints are not those of the data.
     """
     if name not in ESTIMATORS:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
     types = check_joint_types(joint_types)
     drive = DriveKernel(Drive(len(types)) if arm is None else arm.friction)
-    terms = {**ESTIMATORS[name](types, tied), **({} if residual is None else {"local": residual}), "friction": drive}
+    terms = {**ESTIMATORS[name](types, tied), "friction": drive}
     if (name in ROBOT_ESTIMATORS) != (arm is not None):
         raise ValueError(f"estimator {name!r}: only {', '.join(ROBOT_ESTIMATORS)} need an arm, others must have none")
     if arm is None:

@@ -71,7 +71,7 @@ def correction_tables(residual: ResidualKernel) -> dict[str, Array | NDArray[np.
         "rows": np.array(rows),
         "centres": np.concatenate([each.centres / each.lengthscales for each in joints]),
         "weights": np.concatenate([each.weights for each in joints]),
-        "roots": np.concatenate([each.root[np.tril_indices(len(each.root))] for each in joints]),
+        "roots": np.concatenate([each.triangle for each in joints]),
     }
 
 

@@ -38,7 +38,6 @@ from lipcore.kernels.fast.drive import HARMONICS
 from lipcore.kernels.fast.play import CERTAIN_SHARE
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
-from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.body import Body
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compact import CompactPosterior
@@ -236,7 +235,7 @@ def _rest(rest: NonlinearTerm | None, shared: Array) -> dict[str, str]:
 def _correction(posterior: CompactPosterior) -> dict[str, str]:
     """Return the contribution of a local correction, empty if no joint is corrected."""
     residual = posterior.basis.known
-    if not isinstance(residual, ResidualKernel) or not residual.prior.any():
+    if residual is None or not residual.prior.any():
         return {"corrected": "0", "correction": ""}
     tables = correction_tables(residual)
     texts = {
@@ -250,7 +249,7 @@ def _stack(model: TorqueModel) -> str:
     """Return the stack of a call in kB. It contains the links, and covariances and products of energies."""
     n, outputs = model.n_joints, len(model.posterior.basis.outputs)
     residual = model.posterior.basis.known
-    rows = max(len(each.root) for each in residual.joints) if isinstance(residual, ResidualKernel) else 0
+    rows = 0 if residual is None else max(len(each.root) for each in residual.joints)
     return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0) + 8e-3 * rows))
 
 

@@ -36,7 +36,6 @@ from lipcore.files.manifest import (
 from lipcore.files.residual import read_residual, residual_tensors
 from lipcore.files.tensors import FLOOR, INDUCING, MISFIT, OUTPUTS, PARAMS, A, B, read_tensors
 from lipcore.kernels.arm_prior import Arm
-from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.parameters import report
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import warnings
@@ -92,7 +91,7 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
         tensors[MISFIT] = model.posterior.misfit.packed()
     if model.arm is not None:
         tensors |= arm_tensors(model.arm)
-    if isinstance(basis.known, ResidualKernel):
+    if basis.known is not None:
         tensors |= residual_tensors(basis.known)
     parameters = report(model.posterior, model.estimator, model.joint_names)
     payload = save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()})
@@ -328,9 +327,8 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
     residual = read_residual(tensors)
     if (residual is None) == (manifest["estimator"] == LOCAL):
         raise ModelFormatError(f"{TENSORS} must have the tensors of a local correction for {LOCAL} alone", TENSORS)
-    estimator = make_estimator(
-        manifest["estimator"], manifest["joint_types"], bool(options.get("tied", True)), arm, residual
-    )
+    estimator = make_estimator(manifest["estimator"], manifest["joint_types"], bool(options.get("tied", True)), arm)
+    estimator = estimator if residual is None else estimator.corrected(residual)
     misfit = Misfit.unpacked(tensors[MISFIT]) if MISFIT in tensors else None
     if (misfit is not None and misfit.elements.size > 0) != (arm is not None and "play" in arm.drive):
         raise ModelFormatError(f"tensor {MISFIT!r} needs rows of play elements if friction has play", TENSORS)

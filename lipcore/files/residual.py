@@ -29,13 +29,13 @@ def residual_tensors(kernel: ResidualKernel) -> dict[str, Array | Indices]:
         LENGTHSCALES: np.stack([each.lengthscales for each in joints]),
         CENTRES: np.concatenate([each.centres for each in joints]),
         WEIGHTS: np.concatenate([each.weights for each in joints]),
-        ROOTS: np.concatenate([each.root[np.tril_indices(len(each.root))] for each in joints]),
+        ROOTS: np.concatenate([each.triangle for each in joints]),
         VARIANCE: kernel.prior,
     }
 
 
 def check_shapes(shapes: Mapping[str, tuple[int, ...]], n: int) -> str | None:
-    """Return what is wrong with the shapes of a correction's tensors, or None."""
+    """Return the first error in the shapes of a correction's tensors, None if there is none."""
     missing = [name for name in NAMES if name not in shapes]
     if missing:
         return f"lacks the tensor {missing[0]!r}, but has others of a correction"

@@ -284,46 +284,6 @@ class LinearKernel(TorqueKernel):
         return features.reshape(-1, features.shape[-1])
 
 
-class KnownTorque(TorqueKernel):
-    """Torque with a mean and a variance that no sample changes. It has no hyperparameters."""
-
-    @property
-    @abstractmethod
-    def prior(self) -> Array:
-        """Variance of the torques without the samples of the training, (n,) (N·m)²."""
-
-    @abstractmethod
-    def fill_many(self, motions: Array, mean: Array, variance: Array) -> None:
-        """Write the means and variances of N queries, (N, n) each. motions: (N, …, n), as of `Motion.arrays`."""
-
-    def moments(self, x: Motion) -> tuple[Array, Array]:
-        """Return means, N·m, and variances, (N·m)², of the torques at N instants, (N, n) each."""
-        mean, variance = np.empty((2, *x.q.shape))
-        self.fill_many(x.arrays(), mean, variance)
-        return mean, variance
-
-    def mean(self, x: Motion) -> Array:
-        """Return the means of the torques, (N, n) N·m."""
-        return self.moments(x)[0]
-
-    def variance(self, params: Params, x: Motion) -> Array:
-        """Return the covariance of the torques at each sample, (N, n, n)."""
-        return on_last_diagonal(self.moments(x)[1])
-
-    def symmetric_gram(self, params: Params, x: Motion) -> Array:
-        """Return the covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
-        gram = self.gram(params, x, x)
-        return 0.5 * (gram + gram.T)
-
-    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
-        """Return no derivatives: there are no hyperparameters."""
-        return {}
-
-    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Return no hyperparameters."""
-        return {}
-
-
 class PartialKernel(LinearKernel):
     """The torque of some of a linear kernel's weights. mask: of these weights, (p,)."""
 

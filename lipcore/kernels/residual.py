@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from lipcore.data.motion import Array, Motion
-from lipcore.kernels.base import KnownTorque, Params
+from lipcore.kernels.base import Params, TorqueKernel, on_last_diagonal
 from lipcore.kernels.drive.terms import SIGN_WIDTH
+from lipcore.kernels.fast.answer import pack
 from lipcore.kernels.fast.lanes import LANES
-from lipcore.kernels.fast.residual import pack_centres, pack_root, residual_torque
+from lipcore.kernels.fast.residual import PANEL, pack_centres, residual_torque
 
 Indices = NDArray[np.int64]
 
@@ -46,13 +47,20 @@ class JointResidual:
         return Motion(*np.ascontiguousarray(np.split(self.centres, 4, axis=1)[:3]))
 
     @property
+    def triangle(self) -> Array:
+        """The root row by row, down to the diagonal, flat."""
+        return np.asarray(self.root[np.tril_indices(len(self.root))])
+
+    @property
     def gram(self) -> Array:
         """Correlations r of all centres with each other, (m, m)."""
         return _near(self.centres, self.centres, self.lengthscales)
 
 
-class ResidualKernel(KnownTorque):
+class ResidualKernel(TorqueKernel):
     """Torque of mean and variance as of its `JointResidual` in each joint; joints are independent.
+
+    No sample changes it, and it has no hyperparameters.
 
     Example: with one centre at rest and no uncertainty left there.
 
@@ -71,7 +79,7 @@ class ResidualKernel(KnownTorque):
             np.concatenate([pack_centres(each.centres / each.lengthscales) for each in joints]),
             np.cumsum([0, *(len(each) // LANES for each in padded)]).astype(np.int64),
             np.concatenate(padded),
-            np.concatenate([pack_root(each.root) for each in joints]),
+            np.concatenate([pack(each.root, 0, PANEL * LANES) for each in joints]),
             np.array([len(each.root) for each in joints], np.int64),
             self.prior,
             SIGN_WIDTH,
@@ -83,8 +91,22 @@ class ResidualKernel(KnownTorque):
         return np.array([each.variance for each in self.joints])
 
     def fill_many(self, motions: Array, mean: Array, variance: Array) -> None:
-        """Write the means and variances of N queries; see `KnownTorque.fill_many`."""
+        """Write the means and variances of N queries, (N, n) each. motions: (N, …, n), as of `Motion.arrays`."""
         residual_torque(*self._arrays, motions, mean, variance)
+
+    def moments(self, x: Motion) -> tuple[Array, Array]:
+        """Return means, N·m, and variances, (N·m)², of the torques at N instants, (N, n) each."""
+        mean, variance = np.empty((2, *x.q.shape))
+        self.fill_many(x.arrays(), mean, variance)
+        return mean, variance
+
+    def mean(self, x: Motion) -> Array:
+        """Return the means of the torques, (N, n) N·m."""
+        return self.moments(x)[0]
+
+    def variance(self, params: Params, x: Motion) -> Array:
+        """Return the covariance of the torques at each sample, (N, n, n)."""
+        return on_last_diagonal(self.moments(x)[1])
 
     def gram(self, params: Params, x: Motion, y: Motion) -> Array:
         """Return the covariance of all torques of x with those of y, (N n, M n)."""
@@ -94,6 +116,19 @@ class ResidualKernel(KnownTorque):
             learnt = [each.root @ _near(each.centres[: len(each.root)], at, each.lengthscales) for at in (one, other)]
             out[:, j, :, j] = each.variance * _near(one, other, each.lengthscales) - learnt[0].T @ learnt[1]
         return out.reshape(len(x) * n, len(y) * n)
+
+    def symmetric_gram(self, params: Params, x: Motion) -> Array:
+        """Return the covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
+        gram = self.gram(params, x, x)
+        return 0.5 * (gram + gram.T)
+
+    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
+        """Return no derivatives: there are no hyperparameters."""
+        return {}
+
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
+        """Return no hyperparameters."""
+        return {}
 
 
 def residual_inputs(motion: Motion) -> Array:

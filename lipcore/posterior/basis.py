@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.base import Cross, KnownTorque, LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
+from lipcore.kernels.base import Cross, LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.linalg import block_diagonal, cholesky, solve_lower
 
 
@@ -32,7 +33,7 @@ class Basis:
     """Places of the chosen torques among the S n torques, sample by sample, (m,)."""
     root: Array
     """B, (M, M) lower triangular."""
-    known: KnownTorque | None = None
+    known: ResidualKernel | None = None
     """Torque that the variables do not change, or None. Its variance is outside the basis."""
 
     @classmethod
@@ -132,7 +133,7 @@ class Basis:
         return np.asarray(np.maximum(prior - explained, 0.0))
 
 
-def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...], KnownTorque | None]:
+def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...], ResidualKernel | None]:
     """Return the nonlinear term of a kernel, its linear terms, and the known one, None where there is none.
 
     Raise ValueError for any other kernel.
@@ -140,7 +141,7 @@ def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, 
     terms: Sequence[TorqueKernel] = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
     nonlinear = [each for each in terms if isinstance(each, PairKernel)]
     linear = tuple(each for each in terms if isinstance(each, LinearKernel))
-    known = [each for each in terms if isinstance(each, KnownTorque)]
+    known = [each for each in terms if isinstance(each, ResidualKernel)]
     if len(nonlinear) + len(known) > 1 or len(nonlinear) + len(linear) + len(known) < len(terms):
         names = ", ".join(type(each).__name__ for each in terms)
         raise ValueError(f"the kernel's terms are {names}, expected at most one other than linear ones")

@@ -67,15 +67,14 @@ def fit_conformal(posterior: CompactPosterior, samples: Samples, variance: Array
     order = np.lexsort((samples.t, samples.episode))
     ordered = samples.rows(order)
     starts = blocks(ordered)
-    return conformal_of(ordered, scores(posterior, ordered, variance[order], starts))
+    return conformal_of(scores(posterior, ordered, variance[order], starts), starts)
 
 
-def conformal_of(samples: Samples, score: Array) -> Conformal:
-    """Return the factors from the scores of N samples in order, (N, n): |error| / half width of the 95 % interval.
+def conformal_of(score: Array, starts: NDArray[np.int64]) -> Conformal:
+    """Return the factors from scores of N samples in order, (N, n): |error| / half width of the 95 % interval.
 
-    The scores are those of a model that has not seen the sample's block, of a second or a whole episode.
+    The scores are those of a model that has not seen the sample's block; starts: first row of each block.
     """
-    starts = blocks(samples)
     scale, guaranteed = _quantile(score, np.diff(starts, append=len(score)))
     return Conformal(scale, guaranteed, len(starts))
 

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
-from lipcore.kernels.base import KnownTorque, LinearKernel, PairKernel, Params
+from lipcore.kernels.base import LinearKernel, PairKernel, Params
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import COVARIANCE, MEAN, MISFIT_ROWS, ROWS, STD, WIDTH, answer, answer_one, pack
 from lipcore.kernels.fast.play import POSITIONS
 from lipcore.kernels.payload import PayloadKernel
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.misfit import Misfit
 
 Array = NDArray[np.float64]
@@ -89,7 +90,7 @@ class Evaluator:
         floor: Array | None = None,
         misfit: Array | None = None,
         usual: tuple[Array, Array] | None = None,
-        known: KnownTorque | None = None,
+        known: ResidualKernel | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
             raise ValueError("expected both term and inducing, or neither")

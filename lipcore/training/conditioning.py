@@ -102,16 +102,16 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
         for at, name in enumerate(("q", "dq", "ddq"))
     }
     model = replace(model, fit={**model.fit, "samples_posterior": count}, training_range=spans)
-    if not isinstance(posterior.basis.known, ResidualKernel):
+    if posterior.basis.known is None:
         return replace(model, posterior=updated)
-    joints = list(posterior.basis.known.joints)
+    joints, moved = list(posterior.basis.known.joints), updated.weights - posterior.weights
     for joint, each in enumerate(joints):
         if len(each.weights):
-            change = (updated.mean(each.motion) - posterior.mean(each.motion))[:, joint]
+            change = (moved @ posterior.cross(posterior.kernel, each.motion)).reshape(-1, len(joints))[:, joint]
             # learnt like the residual itself, beside the joint's noise
             gram = each.gram + posterior.noise_variance[joint] / each.variance * np.eye(len(change))
             joints[joint] = replace(each, weights=each.weights - cholesky(gram).solve(change))
-    estimator = replace(model.estimator, terms={**model.estimator.terms, "local": ResidualKernel(joints)})
+    estimator = model.estimator.corrected(ResidualKernel(joints))
     updated = updated.corrected(estimator.kernel, updated.noise_variance)
     return replace(model, estimator=estimator, posterior=updated)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from lipcore.data import metrics
 from lipcore.data.independence import recording_weights
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.samples import Array, Samples
@@ -107,7 +108,7 @@ def correct(arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ())
                 variance = found[j].variance - explained + noise[j] + known.covariance[:, j, j]
                 half = quantile(LEVEL) * np.sqrt(variance)
                 score[:, j] = np.abs(left[:, j] - mean) / half
-        conformal = conformal_of(used, score)
+        conformal = conformal_of(score, metrics.blocks(used))
     return Correction(ResidualKernel(found), noise, errors, conformal)
 
 

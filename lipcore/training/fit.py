@@ -24,7 +24,7 @@ from lipcore.posterior.compression import Compression, build_linear, compress_sa
 from lipcore.posterior.conformal import Conformal, fit_conformal
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.statistics import collect
-from lipcore.training.correction import Correction, correct, corrected_joints
+from lipcore.training.correction import correct, corrected_joints
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
 
@@ -68,7 +68,7 @@ def fit_estimator(
                 task.on_progress(FitProgress("posterior", 0, 0, float(learnt.report["objective"]), 0.0, 0.0))
             correction = correct(compression.posterior, samples, corrected)
             report |= correction.report()
-            estimator = _with_correction(estimator, correction)
+            estimator = estimator.corrected(correction.residual)
             posterior = compression.posterior.corrected(estimator.kernel, correction.noise)
             compression = replace(compression, posterior=posterior)
             if correction.conformal is not None:
@@ -109,11 +109,6 @@ def fit_estimator(
         calibration=calibration,
         conformal=conformal,
     )
-
-
-def _with_correction(estimator: Estimator, correction: Correction) -> Estimator:
-    arm, friction = estimator.terms["rigid_body"], estimator.terms["friction"]
-    return Estimator(LOCAL, {"rigid_body": arm, "local": correction.residual, "friction": friction})
 
 
 def compact(

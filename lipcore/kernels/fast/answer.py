@@ -25,16 +25,16 @@ WIDTH = LANES
 """Columns that a panel is multiplied with. A robot with more joints needs several rounds."""
 
 
-def pack(matrix: Array, before: int) -> Array:
+def pack(matrix: Array, before: int, height: int = ROWS) -> Array:
     """Return the panels of `matrix`, (K, M), one after the other, flat. Zeros fill the last panel.
 
-    before: number of columns before those of the diagonal. Elements to the right of each panel's last diagonal element
-    are zero and are not stored.
+    before: number of columns before those of the diagonal; height: rows of a panel. Elements to the right of each
+    panel's last diagonal element are zero and are not stored.
     """
     panels = [np.zeros(0)]
-    for first in range(0, matrix.shape[0], ROWS):
-        rows = matrix[first : first + ROWS, : before + min(first + ROWS, matrix.shape[0])]
-        panel = np.zeros((rows.shape[1], ROWS))
+    for first in range(0, matrix.shape[0], height):
+        rows = matrix[first : first + height, : before + min(first + height, matrix.shape[0])]
+        panel = np.zeros((rows.shape[1], height))
         panel[:, : len(rows)] = rows.T
         panels.append(panel.reshape(-1))
     return np.concatenate(panels)

@@ -27,15 +27,6 @@ def pack_centres(centres: Array) -> Array:
     return padded.reshape(-1, LANES, centres.shape[1]).transpose(0, 2, 1).reshape(-1)
 
 
-def pack_root(root: Array) -> Array:
-    """Return the panels of a lower triangular matrix, (k, k), flat. Zeros fill the last panel."""
-    panels = [np.zeros(0)]
-    for first in range(0, len(root), PANEL * LANES):
-        rows = root[first : first + PANEL * LANES, : first + PANEL * LANES]
-        panels.append(np.pad(rows, ((0, PANEL * LANES - len(rows)), (0, 0))).T.reshape(-1))
-    return np.concatenate(panels)
-
-
 @compiled
 def residual_torque(
     rates: Array,
@@ -54,7 +45,7 @@ def residual_torque(
 
     rates: (n, 4 n), one over each joint's lengthscales; centres: of all joints, as of `pack_centres`, in units of them;
     starts: (n + 1,), where they begin, in Lanes; weights: of all joints, N·m, with zeros to fill the Lanes; roots: of
-    all joints, as of `pack_root`; sizes: (n,), their numbers of rows; prior: (n,), variance without data; motions:
+    all joints, as of `answer.pack`; sizes: (n,), their numbers of rows; prior: (n,), variance without data; motions:
     (N, …, n).
     """
     n = prior.shape[0]
