@@ -50,7 +50,8 @@ class Estimator:
     def corrected(self, residual: ResidualKernel) -> Estimator:
         """Return the arm of this estimator with a local correction."""
         arm, friction = self.terms["rigid_body"], self.terms["friction"]
-        return Estimator(LOCAL, {"rigid_body": arm, "local": residual, "friction": friction})
+        # the residual's features are first, so that a root has the same zeros as the precision
+        return Estimator(LOCAL, {"local": residual, "rigid_body": arm, "friction": friction})
 
 
 class _ResidualChainKernel(ChainKernel):

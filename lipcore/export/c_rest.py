@@ -15,6 +15,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.base import Params
 from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.fast.answer import root_of_part
 from lipcore.kernels.fast.joints import read_rows
 from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.compact import CompactPosterior
@@ -58,20 +59,28 @@ class NonlinearTerm:
         return cls(tables, groups, places, posterior.weights[:count], learnt, posterior.std_factor)
 
 
-def correction_tables(residual: ResidualKernel) -> dict[str, Array | NDArray[np.int64]]:
+def correction_tables(residual: ResidualKernel, posterior: CompactPosterior) -> dict[str, Array | NDArray[np.int64]]:
     """Return the tables of a local correction."""
-    joints = residual.joints
-    counts, rows = (
-        [len(each) for each in part] for part in zip(*((one.weights, one.root) for one in joints), strict=True)
-    )
+    joints, first, size = residual.joints, posterior.basis.rows(residual).start, len(posterior.weights)
+    others = np.delete(np.arange(size), posterior.basis.rows(residual))
+    weights, learnt = [], []
+    for joint, each in enumerate(joints):
+        own, mean = first + residual.of_joint(joint), each.weights.copy()
+        mean[: len(own)] += posterior.weights[own] @ each.root
+        weights.append(mean)
+        # the rows of all other weights are in `LinearWeights.shared`
+        root = root_of_part(posterior.root, np.concatenate([own, others]))[: len(own), : len(own)]
+        learnt.append(posterior.std_factor * root[np.tril_indices(len(own))])
     return {
         "rates": np.stack([1 / each.lengthscales for each in joints]),
         "variance": residual.prior,
-        "starts": np.cumsum([0, *counts]),
-        "rows": np.array(rows),
-        "centres": np.concatenate([each.centres / each.lengthscales for each in joints]),
-        "weights": np.concatenate([each.weights for each in joints]),
+        "taken": np.array([each.taken for each in joints]),
+        "starts": np.cumsum([0, *map(len, weights)]),
+        "rows": np.cumsum([0, *residual.sizes]),
+        "centres": np.concatenate([each.centres for each in joints]),
+        "weights": np.concatenate(weights),
         "roots": np.concatenate([each.triangle for each in joints]),
+        "learnt": np.concatenate(learnt),
     }
 
 

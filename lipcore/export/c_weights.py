@@ -35,7 +35,8 @@ class LinearWeights:
     prior_scaled_root: Array
     """Q Λ, (p, p), with the prior variances Λ of the weights. The covariance of the weights is (Q Λ)ᵀ Q Λ."""
     shared: Array
-    """Q, (p, m), for the m torques of a nonlinear term. If c is their covariance with a query, add Q c to Q Λ Φᵀ."""
+    """Q, (p, m), for the m variables of another term: torques of a nonlinear one, or weights of a residual. If c is
+    their covariance with a query, add Q c to Q Λ Φᵀ."""
     factor: float
     """Factor on the weights' deviations."""
 
@@ -46,10 +47,11 @@ class LinearWeights:
         arm, friction = terms["rigid_body"], terms["friction"]
         assert isinstance(arm, ArmKernel)
         assert isinstance(friction, DriveKernel)
-        if list(posterior.basis.linear) != [arm, friction]:
+        basis = posterior.basis
+        if list(basis.linear[-2:]) != [arm, friction] or len(basis.linear) > 2 + (basis.residual is not None):
             raise UnsupportedEstimatorError("the posterior has weights other than those of rigid bodies and friction")
         diagonals = [each.variances(posterior.params) for each in (arm, friction)]
-        prior, centre, first = np.concatenate(diagonals), arm.prior_weights(), len(posterior.basis.outputs)
+        prior, centre, first = np.concatenate(diagonals), arm.prior_weights(), basis.rows(arm).start
         assert centre is not None
         mean = posterior.weights[first:] * prior
         mean[: arm.size] += centre

@@ -150,7 +150,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "share": share,
         "root": _braced(_panels(root)),
         **_rest(NonlinearTerm.of(posterior), shared),
-        **_correction(posterior),
+        **_correction(posterior, shared),
         "misfit": _braced(misfit),
         "floor": _braced(posterior.floor),
         "range": _braced(np.array(limits)),
@@ -219,37 +219,36 @@ def _rest(rest: NonlinearTerm | None, shared: Array) -> dict[str, str]:
     """Return the contribution of a nonlinear term, empty for rigid bodies alone. shared: V of `LinearWeights.root`."""
     if rest is None:
         return {"outputs": "0", "alpha": "{0}", "learnt": "{0}", "shared": "{0}", "factor": "0", "term": ""}
-    padded = np.pad(shared, ((0, -len(shared) % WIDE), (0, 0)))
     tables = {name: _braced(values) for name, values in rest.tables.items()}
     places = "{" + ",\n".join(_integers(row) for row in rest.places) + "}"
     return {
         "outputs": str(len(rest.alpha)),
         "alpha": _braced(rest.alpha),
         "learnt": _braced(_panels(rest.factor * rest.learnt.T)),
-        "shared": _braced(padded.reshape(-1, WIDE, padded.shape[1]).transpose(0, 2, 1).reshape(-1)),
+        "shared": _braced(_full_panels(shared)),
         "factor": repr(rest.factor**2),
         "term": _template("energy.c").substitute(tables, groups=str(rest.groups), places=places),
     }
 
 
-def _correction(posterior: CompactPosterior) -> dict[str, str]:
-    """Return the contribution of a local correction, empty if no joint is corrected."""
-    residual = posterior.basis.known
+def _correction(posterior: CompactPosterior, shared: Array) -> dict[str, str]:
+    """Return the contribution of a local correction, empty if no joint is corrected. shared: see `_rest`."""
+    residual = posterior.basis.residual
     if residual is None or not residual.prior.any():
         return {"corrected": "0", "correction": ""}
-    tables = correction_tables(residual)
+    tables = correction_tables(residual, posterior) | {"shared": _full_panels(shared)}
     texts = {
         name: _integers(values) if values.dtype == np.int64 else _braced(values) for name, values in tables.items()
     }
-    most = str(max(1, int(tables["rows"].max())))
+    most = str(max(1, int(residual.sizes.max())))
     return {"corrected": "1", "correction": _template("residual.c").substitute(texts, most=most)}
 
 
 def _stack(model: TorqueModel) -> str:
     """Return the stack of a call in kB. It contains the links, and covariances and products of energies."""
     n, outputs = model.n_joints, len(model.posterior.basis.outputs)
-    residual = model.posterior.basis.known
-    rows = 0 if residual is None else max(len(each.root) for each in residual.joints)
+    residual = model.posterior.basis.residual
+    rows = 0 if residual is None else (n + 1) * int(residual.sizes.max())
     return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0) + 8e-3 * rows))
 
 
@@ -259,6 +258,12 @@ def _panels(root: Array) -> Array:
     padded = np.pad(root, ((0, 0), (0, -size % WIDE)))
     starts = range(0, size, WIDE)
     return np.concatenate([padded[: min(at + WIDE, size), at : at + WIDE].reshape(-1) for at in starts])
+
+
+def _full_panels(matrix: Array) -> Array:
+    """Return the matrix' rows, WIDE at a time, column by column: flat, padded with zeros."""
+    padded = np.pad(matrix, ((0, -len(matrix) % WIDE), (0, 0)))
+    return padded.reshape(-1, WIDE, padded.shape[1]).transpose(0, 2, 1).reshape(-1)
 
 
 def _vectors(model: TorqueModel, learnt: LinearWeights) -> Array:
@@ -292,7 +297,8 @@ def _add_payload(model: TorqueModel, learnt: LinearWeights) -> TorqueModel:
     parameters = learnt.arm.arm.parameters.copy()
     parameters[-1] += PAYLOAD.parameters
     loaded = ArmKernel(replace(learnt.arm.arm, parameters=parameters))
-    basis = replace(model.posterior.basis, linear=(loaded, DriveKernel(loaded.arm.friction)))
+    before = model.posterior.basis.linear[:-2]
+    basis = replace(model.posterior.basis, linear=(*before, loaded, DriveKernel(loaded.arm.friction)))
     return replace(model, posterior=replace(model.posterior, basis=basis))
 
 

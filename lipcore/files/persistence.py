@@ -91,8 +91,8 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
         tensors[MISFIT] = model.posterior.misfit.packed()
     if model.arm is not None:
         tensors |= arm_tensors(model.arm)
-    if basis.known is not None:
-        tensors |= residual_tensors(basis.known)
+    if basis.residual is not None:
+        tensors |= residual_tensors(basis.residual)
     parameters = report(model.posterior, model.estimator, model.joint_names)
     payload = save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()})
     manifest = {

@@ -6,6 +6,7 @@ from dataclasses import fields
 
 import numpy as np
 from array_api_compat import array_namespace
+from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -95,6 +96,14 @@ class ArmKernel(LinearKernel):
     def regressor(self) -> Regressor:
         """Return the regressor that computes the same features for single queries."""
         return ArmRegressor(self)
+
+    def of_joint(self, joint: int) -> NDArray[np.int64]:
+        """Return the places of the weights that a joint's torque may depend on: not of the bodies before it."""
+        n, place = self.n_joints, self.arm.place
+        used = np.ones(self.size, dtype=bool)
+        used[: PARAMETERS * n] = np.repeat(place >= place[joint], PARAMETERS)
+        used[PARAMETERS * n : self.steps.start] = np.arange(n) == joint
+        return np.flatnonzero(used)
 
     def variances(self, params: Params) -> Array:
         """Return the prior variances of the weights, (p,)."""

@@ -241,6 +241,10 @@ class LinearKernel(TorqueKernel):
         """Return Φ at each sample, (N, n, p)."""
         return self.regressor().features(x.arrays())
 
+    def of_joint(self, joint: int) -> NDArray[np.int64]:
+        """Return the places of the weights that a joint's torque may depend on, rising: all by default."""
+        return np.arange(self.regressor().size)
+
     @abstractmethod
     def variances(self, params: Params) -> Array:
         """Return the prior variances of the weights, the diagonal of Λ, (p,)."""
@@ -281,7 +285,7 @@ class LinearKernel(TorqueKernel):
     def flat_features(self, x: Motion) -> Array:
         """Return Φ of all torques, sample by sample, (N n, p)."""
         features = self.features(x)
-        return features.reshape(-1, features.shape[-1])
+        return features.reshape(len(x) * self.n_joints, features.shape[-1])
 
 
 class PartialKernel(LinearKernel):

@@ -1,4 +1,4 @@
-"""The torque that training has learnt beside the arm: near its motion only, and the same until the next training."""
+"""The torque beside the arm that is learnt near the motion of the training only."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
 
 from lipcore.data.motion import Array, Motion
-from lipcore.kernels.base import Params, TorqueKernel, on_last_diagonal
+from lipcore.kernels.base import LinearKernel, Params, Regressor, on_last_diagonal
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import pack
 from lipcore.kernels.fast.lanes import LANES
@@ -20,121 +19,134 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class JointResidual:
-    """What is known of the residual of one joint, with r_c(x) = exp(−½ Σ_d (x_d − z_cd)² / ℓ_d²) at m centres z_c.
+    """The residual of one joint, with r_c(x) = exp(−½ Σ_d (x_d / ℓ_d − z_cd)²) at m centres z_c.
 
-    The mean is Σ_c weights_c r_c(x), the variance is variance − |root (r_1, …, r_k)|².
+    Its prior mean is Σ_c weights_c r_c(x), what the training has learnt at all centres. Its features are φ = root (r_1,
+    …, r_k), of the first k centres. They leave the variance (variance − |φ|²) (1 − taken max_c r_c(x)²). If the torque
+    at a centre c is known, that at x has 1 − r_c(x)² of its variance.
     """
 
     lengthscales: Array
     """ℓ, (4 n,), in the units of `inputs`."""
     centres: Array
-    """z, (m, 4 n)."""
+    """z, (m, 4 n), of float32 numbers: half the memory to read for each query."""
     weights: Array
     """(m,) N·m."""
     root: Array
     """Lower triangular, (k, k) N·m, of the first k centres."""
     variance: float
-    """Variance far from all centres, (N·m)²."""
+    """Variance without data, (N·m)²."""
+    taken: float
+    """Share of what the features leave that the training has learnt at the centres, 0 to 1."""
 
     @classmethod
     def none(cls, n: int) -> JointResidual:
         """Return a residual of zero, for one of n joints."""
-        return cls(np.ones(4 * n), np.zeros((0, 4 * n)), np.zeros(0), np.zeros((0, 0)), 0.0)
-
-    @property
-    def motion(self) -> Motion:
-        """The motion at the centres."""
-        return Motion(*np.ascontiguousarray(np.split(self.centres, 4, axis=1)[:3]))
+        return cls(np.ones(4 * n), np.zeros((0, 4 * n)), np.zeros(0), np.zeros((0, 0)), 0.0, 0.0)
 
     @property
     def triangle(self) -> Array:
         """The root row by row, down to the diagonal, flat."""
         return np.asarray(self.root[np.tril_indices(len(self.root))])
 
-    @property
-    def gram(self) -> Array:
-        """Correlations r of all centres with each other, (m, m)."""
-        return _near(self.centres, self.centres, self.lengthscales)
 
+class ResidualKernel(LinearKernel):
+    """Gaussian processes on the residuals of n joints, independent of each other: what an arm and its drives leave.
 
-class ResidualKernel(TorqueKernel):
-    """Torque of mean and variance as of its `JointResidual` in each joint; joints are independent.
+    The weights of the features, one joint's after another's, are independent with variance one. The kernel has no
+    hyperparameters.
 
-    No sample changes it, and it has no hyperparameters.
+    Example: with one centre at rest, and one feature.
 
-    Example: with one centre at rest and no uncertainty left there.
-
-    >>> joint = JointResidual(np.ones(4), np.zeros((1, 4)), np.array([2.0]), np.array([[0.5]]), 0.25)
+    >>> joint = JointResidual(np.ones(4), np.zeros((1, 4)), np.array([2.0]), np.array([[0.5]]), 0.25, 0.0)
     >>> rest, far = Motion(*np.zeros((3, 1, 1))), Motion(np.full((1, 1), 10.0), *np.zeros((2, 1, 1)))
     >>> kernel = ResidualKernel([joint])
-    >>> [(float(kernel.mean(x)[0, 0].round(6)), float(kernel.variance({}, x)[0, 0, 0])) for x in (rest, far)]
+    >>> [(float(kernel.mean(x)[0, 0].round(6)), float(kernel.beyond(x)[0, 0])) for x in (rest, far)]
     [(2.0, 0.0), (0.0, 0.25)]
     """
 
     def __init__(self, joints: list[JointResidual]) -> None:
         self.n_joints, self.joints = len(joints), joints
         padded = [np.pad(each.weights, (0, -len(each.weights) % LANES)) for each in joints]
+        self.sizes = np.array([len(each.root) for each in joints], np.int64)
         self._arrays = (
             np.stack([1 / each.lengthscales for each in joints]),
-            np.concatenate([pack_centres(each.centres / each.lengthscales) for each in joints]),
+            np.concatenate([pack_centres(each.centres) for each in joints]),
             np.cumsum([0, *(len(each) // LANES for each in padded)]).astype(np.int64),
             np.concatenate(padded),
             np.concatenate([pack(each.root, 0, PANEL * LANES) for each in joints]),
-            np.array([len(each.root) for each in joints], np.int64),
+            self.sizes,
             self.prior,
+            np.array([each.taken for each in joints]),
             SIGN_WIDTH,
         )
 
     @property
     def prior(self) -> Array:
-        """Variance of the torques far from the training's motion, (n,) (N·m)²."""
+        """Variance of the torques without data, (n,) (N·m)²."""
         return np.array([each.variance for each in self.joints])
 
-    def fill_many(self, motions: Array, mean: Array, variance: Array) -> None:
-        """Write the means and variances of N queries, (N, n) each. motions: (N, …, n), as of `Motion.arrays`."""
-        residual_torque(*self._arrays, motions, mean, variance)
+    def of_joint(self, joint: int) -> Indices:
+        """Return the places of the weights of a joint's features."""
+        return self.sizes[:joint].sum() + np.arange(self.sizes[joint])
 
-    def moments(self, x: Motion) -> tuple[Array, Array]:
-        """Return means, N·m, and variances, (N·m)², of the torques at N instants, (N, n) each."""
-        mean, variance = np.empty((2, *x.q.shape))
-        self.fill_many(x.arrays(), mean, variance)
-        return mean, variance
+    def fill_all(self, motions: Array, features: Array, first: int, mean: Array, beyond: Array) -> None:
+        """Write what `residual_torque` computes of N queries. motions: (N, …, n), as of `Motion.arrays`."""
+        residual_torque(*self._arrays, motions, features, first, mean, beyond)
+
+    def regressor(self) -> Regressor:
+        """Return the regressor of all features."""
+        return _ResidualRegressor(self)
+
+    def variances(self, params: Params) -> Array:
+        """Return ones, (p,)."""
+        return np.ones(int(self.sizes.sum()))
 
     def mean(self, x: Motion) -> Array:
-        """Return the means of the torques, (N, n) N·m."""
-        return self.moments(x)[0]
+        """Return the prior mean of the torques, (N, n) N·m."""
+        return self._moments(x)[0]
+
+    def beyond(self, x: Motion) -> Array:
+        """Return the prior variance of the torques that the features leave, (N, n) (N·m)²."""
+        return self._moments(x)[1]
 
     def variance(self, params: Params, x: Motion) -> Array:
-        """Return the covariance of the torques at each sample, (N, n, n)."""
-        return on_last_diagonal(self.moments(x)[1])
-
-    def gram(self, params: Params, x: Motion, y: Motion) -> Array:
-        """Return the covariance of all torques of x with those of y, (N n, M n)."""
-        n, one, other = self.n_joints, residual_inputs(x), residual_inputs(y)
-        out = np.zeros((len(x), n, len(y), n))
-        for j, each in enumerate(self.joints):
-            learnt = [each.root @ _near(each.centres[: len(each.root)], at, each.lengthscales) for at in (one, other)]
-            out[:, j, :, j] = each.variance * _near(one, other, each.lengthscales) - learnt[0].T @ learnt[1]
-        return out.reshape(len(x) * n, len(y) * n)
+        """Return the prior covariance of the torques at each sample, (N, n, n)."""
+        return super().variance(params, x) + on_last_diagonal(self.beyond(x))
 
     def symmetric_gram(self, params: Params, x: Motion) -> Array:
-        """Return the covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
-        gram = self.gram(params, x, x)
-        return 0.5 * (gram + gram.T)
+        """Return the covariance of all torques of x with each other, (N n, N n), exactly symmetric.
 
-    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
-        """Return no derivatives: there are no hyperparameters."""
-        return {}
+        What the features leave is independent in each sample.
+        """
+        return super().symmetric_gram(params, x) + np.diag(self.beyond(x).reshape(-1))
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Return no hyperparameters."""
         return {}
 
+    def _moments(self, x: Motion) -> tuple[Array, Array]:
+        mean, beyond = np.empty((2, *x.q.shape))
+        self.fill_all(x.arrays(), np.empty((len(x), int(self.sizes.sum()), self.n_joints)), 0, mean, beyond)
+        return mean, beyond
+
+
+class _ResidualRegressor(Regressor):
+    """Features of a residual."""
+
+    def __init__(self, kernel: ResidualKernel) -> None:
+        self.n_joints, self.size, self._kernel = kernel.n_joints, int(kernel.sizes.sum()), kernel
+
+    def fill(self, motion: Array, out: Array) -> None:
+        """Write Φᵀ of one query; see `Regressor.fill`."""
+        self.fill_many(motion[None], out[None], 0)
+
+    def fill_many(self, motions: Array, out: Array, first: int) -> None:
+        """Write Φᵀ of N queries; see `Regressor.fill_many`."""
+        unused = np.empty((2, len(motions), self.n_joints))
+        self._kernel.fill_all(motions, out, first, *unused)
+
 
 def residual_inputs(motion: Motion) -> Array:
     """Return x = (q, dq, ddq, tanh(dq / SIGN_WIDTH)) of N instants, (N, 4 n)."""
     return np.concatenate([motion.q, motion.dq, motion.ddq, np.tanh(motion.dq / SIGN_WIDTH)], axis=1)
-
-
-def _near(one: Array, other: Array, lengthscales: Array) -> Array:
-    return np.asarray(np.exp(-0.5 * cdist(one / lengthscales, other / lengthscales, "sqeuclidean")))

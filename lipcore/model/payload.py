@@ -141,8 +141,8 @@ class Carrier:
         motion, posterior = Motion.from_arrays(q, dq, ddq), self.model.posterior
         features, base = LinearisedCarrier(self, self.known(np.zeros(PARAMETERS))).rows(motion)
         variance = posterior.noise_variance + posterior.misfit.variance(motion)
-        if posterior.basis.known is not None:
-            variance = variance + posterior.basis.known.moments(motion)[1]
+        if posterior.basis.residual is not None:
+            variance = variance + posterior.basis.residual.beyond(motion)
         return Memory.of(motion.arrays(), base, features[:-PARAMETERS], self.rows, self.mean, self.covariance, variance)
 
     @cached_property
@@ -199,8 +199,8 @@ class Carrier:
             out[places] = features.transpose(2, 0, 1) * self.root[places][:, None, None]
             if weights is not None:
                 base += features @ weights
-        if posterior.basis.known is not None:
-            base += posterior.basis.known.mean(motion)
+        if posterior.basis.residual is not None:
+            base += posterior.basis.residual.mean(motion)
         if posterior.basis.term is not None:
             # features of the nonlinear term: its torques are whitened by a root that is not diagonal
             whitened, _ = posterior.basis.features_and_uncovered(motion)

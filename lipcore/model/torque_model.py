@@ -293,5 +293,4 @@ class TorqueModel:
             posterior.floor,
             posterior.misfit.packed(),
             None if torque is None else (np.array(torque["mean"]), np.square(torque["std"])),
-            basis.known,
         )

@@ -33,8 +33,6 @@ class Basis:
     """Places of the chosen torques among the S n torques, sample by sample, (m,)."""
     root: Array
     """B, (M, M) lower triangular."""
-    known: ResidualKernel | None = None
-    """Torque that the variables do not change, or None. Its variance is outside the basis."""
 
     @classmethod
     def build(cls, kernel: TorqueKernel, params: Params, inducing: Motion, outputs: Indices) -> Basis:
@@ -43,7 +41,7 @@ class Basis:
         params: hyperparameters; inducing: S samples; outputs: (m,), chosen torques, numbered as sample · n + joint.
         Raise ValueError if outputs and terms do not match.
         """
-        term, linear, known = split(kernel)
+        term, linear = split(kernel)
         places = len(inducing) * kernel.n_joints
         if outputs.ndim != 1 or len(np.unique(outputs)) != len(outputs) or (term is None and len(outputs)):
             raise ValueError(f"outputs has shape {outputs.shape}, expected (m,) distinct places of torques")
@@ -54,7 +52,7 @@ class Basis:
             gram = term.symmetric_gram(params, inducing)
             roots.insert(0, cholesky(gram[np.ix_(outputs, outputs)]).lower)
         # files store no deflections, on which only linear terms depend
-        return cls(term, linear, params, replace(inducing, deflections=None), outputs, block_diagonal(roots), known)
+        return cls(term, linear, params, replace(inducing, deflections=None), outputs, block_diagonal(roots))
 
     def __len__(self) -> int:
         return len(self.root)
@@ -79,8 +77,8 @@ class Basis:
         return self._open(self.prior(query), features)
 
     def prior(self, query: Motion) -> Array:
-        """Return the variance of the nonlinear and the known torque at N queries, (N, n); zero without such terms."""
-        total = np.zeros_like(query.q) if self.known is None else self.known.moments(query)[1]
+        """Return the variance at N queries, (N, n), of the nonlinear term and of what features of a residual leave."""
+        total = np.zeros_like(query.q) if self.residual is None else self.residual.beyond(query)
         if self.term is not None:
             total += self.term.variance(self.params, query).diagonal(axis1=1, axis2=2)
         return total
@@ -99,6 +97,11 @@ class Basis:
         gram = blocks[:, :size].transpose(1, 2, 0, 3).reshape(size * n, len(query) * n)[self.outputs]
         features = self._whitened(gram, query)
         return features, self._open(blocks[:, size].diagonal(axis1=1, axis2=2), features)
+
+    @cached_property
+    def residual(self) -> ResidualKernel | None:
+        """The linear term that has a variance beyond its features, or None."""
+        return next((each for each in self.linear if isinstance(each, ResidualKernel)), None)
 
     @cached_property
     def _cross(self) -> Cross | None:
@@ -133,16 +136,12 @@ class Basis:
         return np.asarray(np.maximum(prior - explained, 0.0))
 
 
-def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...], ResidualKernel | None]:
-    """Return the nonlinear term of a kernel, its linear terms, and the known one, None where there is none.
-
-    Raise ValueError for any other kernel.
-    """
+def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...]]:
+    """Return the nonlinear term of a kernel, or None, and its linear terms. Raise ValueError for any other kernel."""
     terms: Sequence[TorqueKernel] = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
     nonlinear = [each for each in terms if isinstance(each, PairKernel)]
     linear = tuple(each for each in terms if isinstance(each, LinearKernel))
-    known = [each for each in terms if isinstance(each, ResidualKernel)]
-    if len(nonlinear) + len(known) > 1 or len(nonlinear) + len(linear) + len(known) < len(terms):
+    if len(nonlinear) > 1 or len(nonlinear) + len(linear) < len(terms):
         names = ", ".join(type(each).__name__ for each in terms)
-        raise ValueError(f"the kernel's terms are {names}, expected at most one other than linear ones")
-    return (nonlinear[0] if nonlinear else None), linear, (known[0] if known else None)
+        raise ValueError(f"the kernel's terms are {names}, expected at most one pair kernel beside linear ones")
+    return (nonlinear[0] if nonlinear else None), linear

@@ -10,9 +10,9 @@ import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.base import LinearKernel, Params, TorqueKernel, on_last_diagonal
-from lipcore.posterior.basis import Basis, split
+from lipcore.posterior.basis import Basis
 from lipcore.posterior.exact import Posterior, Prediction
-from lipcore.posterior.linalg import solve_lower, solve_lower_right
+from lipcore.posterior.linalg import block_diagonal, solve_lower, solve_lower_right
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Solution, Statistics, learnt_root, solve
 
@@ -122,20 +122,36 @@ class CompactPosterior(Posterior):
         misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
         return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor, misfit)
 
-    def corrected(self, kernel: TorqueKernel, noise_variance: Array) -> CompactPosterior:
-        """Return this posterior of the same variables beside a known torque.
+    def corrected(self, kernel: TorqueKernel, noise_variance: Array, a: Array) -> CompactPosterior:
+        """Return this posterior beside a residual, whose weights have a mean of zero.
 
-        kernel: with that torque; noise_variance: beside it, (n,) (N·m)². The misfit stays, for motion far from samples.
+        kernel: with the residual before all other terms; noise_variance: beside it, (n,) (N·m)²; a: A of its samples,
+        (p, p). The misfit stays, for motion far from samples. Raise ValueError if this posterior is more than one sum.
         """
+        if self.statistics is None:
+            raise ValueError("the posterior has no statistics, expected one as trained")
         params = {**self.params, "noise.log_std": 0.5 * np.log(noise_variance)}
         noise_variance = np.exp(2 * params["noise.log_std"])  # to the last bit as a file will be read
-        *_, known = split(kernel)
-        basis = replace(self.basis, params=params, known=known)
-        return replace(self, kernel=kernel, params=params, basis=basis, noise_variance=noise_variance)
+        basis = Basis.build(kernel, params, self.basis.inducing, self.basis.outputs)
+        sums = Statistics(
+            block_diagonal([a, self.statistics.a]),
+            np.concatenate([np.zeros(len(a)), self.statistics.b]),
+            self.statistics.samples,
+        )
+        return self.build(kernel, basis, sums, noise_variance, self.std_factor, self.misfit)
 
     def row_variance(self, motion: Motion) -> Array:
         """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)², within the reach of the basis."""
-        return self.misfit.of_row(self.noise_variance, motion)
+        return self.row_misfit.of_row(self.noise_variance, motion)
+
+    @property
+    def row_misfit(self) -> Misfit:
+        """The misfit of rows that are learnt: lasting errors that a residual has learnt are not part of their noise."""
+        residual = self.basis.residual
+        if residual is None:
+            return self.misfit
+        left = np.maximum(self.misfit.lasting - residual.prior, 0.0)
+        return replace(self.misfit, lasting=np.minimum(left, self.noise_variance))
 
     def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
         """Return the posterior mean and n×n covariance of the torques at each of N queries, or of one kernel term.

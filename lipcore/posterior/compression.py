@@ -170,7 +170,7 @@ class _Candidates:
     @classmethod
     def build(cls, exact: ExactPosterior, tau: Array, noise: Array, check: Motion, most: int) -> _Candidates:
         kernel, params, motion = exact.kernel, exact.params, exact.motion
-        term, linear, _ = split(kernel)
+        term, linear = split(kernel)
         precision = np.tile(1 / np.sqrt(noise), len(motion))
         weights_only = Basis.build(SumKernel(*linear), params, motion[:0], NO_OUTPUTS)
         trained, asked = weights_only.features(motion) * precision, weights_only.features(check)

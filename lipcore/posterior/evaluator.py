@@ -14,7 +14,18 @@ from lipcore.kernels.base import LinearKernel, PairKernel, Params
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.kernels.drive.terms import SIGN_WIDTH
-from lipcore.kernels.fast.answer import COVARIANCE, MEAN, MISFIT_ROWS, ROWS, STD, WIDTH, answer, answer_one, pack
+from lipcore.kernels.fast.answer import (
+    COVARIANCE,
+    MEAN,
+    MISFIT_ROWS,
+    ROWS,
+    STD,
+    WIDTH,
+    answer,
+    answer_one,
+    pack,
+    pack_joints,
+)
 from lipcore.kernels.fast.play import POSITIONS
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.kernels.residual import ResidualKernel
@@ -41,13 +52,13 @@ class _Scratch(threading.local):
         self.std = np.zeros((queries, n))
         self.covariance = np.zeros((queries, n, n))
         self.share = np.zeros((queries, n))
-        self.known = np.zeros((2, queries, n))
+        self.prior = np.zeros((2, queries, n))
         self.of_one = (
             self.motions,
             self.deflected,
             self.blocks,
             self.features,
-            self.known,
+            self.prior,
             self.covariance,
             self.memory,
             self.std,
@@ -66,8 +77,11 @@ class Evaluator:
     None without `term`. outputs: (m,), the chosen torques, as sample · n + joint. linear: the linear terms in the order
     of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,) (N·m)²;
     misfit: see `Misfit.packed`; None for no floor or misfit. usual: mean and variance of the torque in
-    training, (n,) each, if predictions may fall back. known: torque that the anchors do not change. Its mean is added
-    to the mean, its variance to the misfit.
+    training, (n,) each, if predictions may fall back.
+
+    Without a nonlinear term, torques and standard deviations are computed joint by joint, each from the weights that it
+    depends on; covariances need them all. The prior mean of a residual among the linear terms is added to the mean, the
+    variance beyond its features to the misfit.
 
     `one` and `many` return the mean of the posterior, which learning and external torque need. They also return the
     share of the fallback in the torque to send, which `fall_back` computes.
@@ -90,33 +104,39 @@ class Evaluator:
         floor: Array | None = None,
         misfit: Array | None = None,
         usual: tuple[Array, Array] | None = None,
-        known: ResidualKernel | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
             raise ValueError("expected both term and inducing, or neither")
-        if term is not None and known is not None:
-            raise ValueError("term and known are both given, expected one of them")
         if term is None and not linear:
             raise ValueError("term is None and linear is empty, expected at least one term")
         self.n_joints = n = linear[0].n_joints if term is None else term.n_joints
         self._cross = None if term is None or inducing is None else term.cross(params, inducing)
-        self._known = known
         samples = 0 if self._cross is None else self._cross.size
         self._outputs = np.array(outputs, dtype=np.int64)
         means, variances = _linear_prior(linear, params)
         _check(self._outputs, samples * n, weights, root, len(means))
-        self._fixed = _lay_out(weights, root, means, variances)
-        self._fills, self._fills_many = [], []
+        self._fills, self._fills_many, self._residual = [], [], None
         self._payload = slice(0, 0)
         first = 0
         for kernel in linear:
             regressor = kernel.regressor()
             last = first + regressor.size
-            self._fills.append((first, last, regressor.fill))
-            self._fills_many.append((first, regressor.fill_many, isinstance(kernel, DriveKernel | PayloadKernel)))
+            if isinstance(kernel, ResidualKernel):
+                self._residual = first, kernel
+            else:
+                self._fills.append((first, last, regressor.fill))
+                self._fills_many.append((first, regressor.fill_many, isinstance(kernel, DriveKernel | PayloadKernel)))
             if isinstance(kernel, PayloadKernel):
                 self._payload = slice(first, last)
             first = last
+        if self._residual is not None and term is not None:
+            raise ValueError("linear has a residual beside a nonlinear term, expected one of them")
+        parts = _of_joints(linear) if term is None else []
+        self._counts = np.array([len(each) for each in parts], np.int64)
+        self._places = np.zeros((len(parts), self._counts.max(initial=0)), np.int64)
+        for row, each in zip(self._places, parts, strict=True):
+            row[: len(each)] = each
+        self._fixed = _lay_out(weights, root, means, variances, parts)
         self._std_factor = float(std_factor)
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
@@ -163,7 +183,7 @@ class Evaluator:
         """
         scratch, what = self._one, STD if std or self._falls_back else MEAN
         # slicing would cost as much as the arithmetic
-        query, deflected, blocks, features, known, work, memory, own, share = scratch.of_one
+        query, deflected, blocks, features, prior, work, memory, own, share = scratch.of_one
         if covariance is not None:
             work, what = covariance, COVARIANCE
         if len(motion) > POSITIONS:
@@ -171,8 +191,8 @@ class Evaluator:
         query[0] = motion
         if self._cross is not None:
             self._cross.fill_many(query, blocks)
-        if self._known is not None:
-            self._known.fill_many(query, known[0], known[1])
+        if self._residual is not None:
+            self._residual[1].fill_all(query, features, self._residual[0], prior[0], prior[1])
         for first, last, fill in self._fills:
             fill(query[0], features[0, first:last])
         tau = np.empty((1, self.n_joints))
@@ -180,9 +200,11 @@ class Evaluator:
         doubtful = answer_one(
             self._fixed,
             self._outputs,
+            self._places,
+            self._counts,
             blocks,
             features,
-            known[1],
+            prior[1],
             self._std_factor,
             self._floor,
             self._misfit,
@@ -196,8 +218,8 @@ class Evaluator:
             work,
             share,
         )
-        if self._known is not None:
-            tau += known[0]
+        if self._residual is not None:
+            tau += prior[0]
         return tau[0], deviation[0] if std else None, share[0].copy() if doubtful else None
 
     def many(
@@ -270,19 +292,21 @@ class Evaluator:
     ) -> bool:
         """Compute N queries. moving: their motion for friction and payload."""
         count = len(motions)
-        blocks, features, known = scratch.blocks[:count], scratch.features[:count], scratch.known[:, :count]
+        blocks, features, prior = scratch.blocks[:count], scratch.features[:count], scratch.prior[:, :count]
         if self._cross is not None:
             self._cross.fill_many(motions, blocks)
-        if self._known is not None:
-            self._known.fill_many(motions, known[0], known[1])
+        if self._residual is not None:
+            self._residual[1].fill_all(motions, features, self._residual[0], prior[0], prior[1])
         for first, fill_many, moves in self._fills_many:
             fill_many(moving if moves else motions, features, first)
         doubtful = answer(
             self._fixed,
             self._outputs,
+            self._places,
+            self._counts,
             blocks,
             features,
-            known[1],
+            prior[1],
             self._std_factor,
             self._floor,
             self._misfit,
@@ -296,8 +320,8 @@ class Evaluator:
             covariance,
             share,
         )
-        if self._known is not None:
-            tau += known[0]
+        if self._residual is not None:
+            tau += prior[0]
         return doubtful
 
 
@@ -326,7 +350,14 @@ def _check(outputs: Indices, torques: int, weights: Array, root: Array, linear_w
         raise ValueError("root has elements above the diagonal, expected a lower triangular matrix")
 
 
-def _lay_out(weights: Array, root: Array, means: Array, variances: Array) -> Array:
+def _of_joints(linear: Sequence[LinearKernel]) -> list[Indices]:
+    """Return the places among all linear weights of those that each joint's torque may depend on."""
+    first = np.cumsum([0, *(each.regressor().size for each in linear)])
+    of_term = list(zip(first, linear, strict=False))
+    return [np.concatenate([at + each.of_joint(j) for at, each in of_term]) for j in range(linear[0].n_joints)]
+
+
+def _lay_out(weights: Array, root: Array, means: Array, variances: Array, parts: list[Indices]) -> Array:
     """Return the `fixed` array of `answer`, for features Φᵀ instead of their covariances Λ Φᵀ."""
     scale = np.ones(len(weights))
     scale[len(scale) - len(variances) :] = variances
@@ -335,4 +366,4 @@ def _lay_out(weights: Array, root: Array, means: Array, variances: Array) -> Arr
     root, chosen = root * scale, len(weights) - len(variances)
     # rows of a panel have the same sign
     panels = [pack(root[:chosen], 0), pack(root[chosen:], chosen)]
-    return np.concatenate([pack(slopes[None], len(slopes)), *panels])
+    return np.concatenate([pack(slopes[None], len(slopes)), *panels, pack_joints(slopes, root, parts)])

@@ -11,7 +11,6 @@ import numpy as np
 
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import LinearKernel, Params, SumKernel, TorqueKernel
-from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.linalg import Factor, add_diagonal, cholesky
 from lipcore.vocabulary import Device
 
@@ -76,7 +75,7 @@ class Posterior(ABC):
         for term in kernel.terms if isinstance(kernel, SumKernel) else (kernel,):
             if isinstance(term, LinearKernel):
                 total += self.with_weights(term, term.variances(self.params)[:, None] * term.flat_features(query).T)
-            elif not isinstance(term, ResidualKernel):  # that is independent of the anchors
+            else:
                 total += self.with_torques(term, lambda anchor, k=term: k.gram(self.params, anchor, query))  # type: ignore[misc]
         return total
 

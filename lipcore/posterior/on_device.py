@@ -21,7 +21,7 @@ def evidence_on(
     kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, device: str
 ) -> tuple[float, dict[str, Array]]:
     """Return −log evidence, nats, and its gradient. Arguments: see `exact.negative_log_evidence`."""
-    term, linear, _ = split(kernel)
+    term, linear = split(kernel)
     assert term is not None
     n, size, noise = kernel.n_joints, len(motion), tensor(params["noise.log_std"], device)
     variance = torch.exp(2 * noise)

@@ -7,7 +7,7 @@ is added to the sum by BLAS's `syrk`, which computes one triangle only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -64,15 +64,8 @@ class Summing:
 
     @classmethod
     def of(cls, posterior: CompactPosterior, device: Device = "cpu") -> Summing:
-        """Return the summation for a posterior, on a device.
-
-        A known torque is subtracted, but its prior variance counts as noise: the training has learnt it from the same
-        samples.
-        """
-        basis, noise, known = posterior.basis, posterior.noise_variance, posterior.basis.known
-        if known is not None:
-            basis, noise = replace(basis, known=None), noise + known.prior
-        return cls(posterior.kernel, basis, noise, posterior.misfit, device)
+        """Return the summation for a posterior, on a device."""
+        return cls(posterior.kernel, posterior.basis, posterior.noise_variance, posterior.row_misfit, device)
 
     def add(self, total: Total, samples: Samples, weights: Array | None = None) -> None:
         """Add samples to a total. weights: (N,), one for each sample, None for all one."""

@@ -10,10 +10,9 @@ import numpy as np
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators.hyperparameters import FitCancelledError
 from lipcore.estimators.options import FitOptions
-from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.linalg import cholesky, unpack_symmetric
+from lipcore.posterior.linalg import unpack_symmetric
 from lipcore.posterior.statistics import Statistics
 from lipcore.posterior.summing import CHUNK, Summing, Total
 
@@ -84,8 +83,7 @@ def sum_samples(
 def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> TorqueModel:
     """Return the model with the posterior of `count` samples with these sums, instead of those of its fit.
 
-    Hyperparameters and basis do not change. The sums are those of the arm beside a local correction. It gives back at
-    its centres what they change in the arm.
+    Hyperparameters and basis do not change.
     """
     posterior = model.posterior
     statistics = Statistics(unpack_symmetric("a", sums.a), sums.b, sums.weight)
@@ -101,19 +99,7 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
         name: {"min": sums.low[at].tolist(), "max": sums.high[at].tolist()}
         for at, name in enumerate(("q", "dq", "ddq"))
     }
-    model = replace(model, fit={**model.fit, "samples_posterior": count}, training_range=spans)
-    if posterior.basis.known is None:
-        return replace(model, posterior=updated)
-    joints, moved = list(posterior.basis.known.joints), updated.weights - posterior.weights
-    for joint, each in enumerate(joints):
-        if len(each.weights):
-            change = (moved @ posterior.cross(posterior.kernel, each.motion)).reshape(-1, len(joints))[:, joint]
-            # learnt like the residual itself, beside the joint's noise
-            gram = each.gram + posterior.noise_variance[joint] / each.variance * np.eye(len(change))
-            joints[joint] = replace(each, weights=each.weights - cholesky(gram).solve(change))
-    estimator = model.estimator.corrected(ResidualKernel(joints))
-    updated = updated.corrected(estimator.kernel, updated.noise_variance)
-    return replace(model, estimator=estimator, posterior=updated)
+    return replace(model, posterior=updated, fit={**model.fit, "samples_posterior": count}, training_range=spans)
 
 
 def condition(

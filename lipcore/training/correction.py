@@ -11,19 +11,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from lipcore.data import metrics
 from lipcore.data.independence import recording_weights
 from lipcore.data.metrics import LEVEL, quantile
+from lipcore.data.motion import Indices
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S, SplitRows, apply_guard
 from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.conformal import Conformal, conformal_of
-from lipcore.posterior.linalg import Factor, add_diagonal, cholesky, solve_lower, solve_lower_right
+from lipcore.posterior.linalg import add_diagonal, block_diagonal, cholesky, solve_lower, solve_lower_right
 from lipcore.posterior.selection import Pivots, pivots
-from lipcore.posterior.statistics import learnt_root
 from lipcore.training import lengthscales
 from lipcore.training.lengthscales import Shape, fit_shapes
 
@@ -45,9 +46,9 @@ class CorrectionOptions:
     sizes: tuple[int, ...] = (25, 50, 100, 200, 400, 800, 1500)
     """Numbers of centres that are tried, the fewest first."""
     min_progress: float = 0.02
-    """Min gain of the squared error from more centres than standard deviations use."""
-    std_centres: int = 200
-    """Max number of centres that standard deviations are computed from, because their cost grows with its square."""
+    """Min gain of the squared error from more centres than `features`."""
+    features: int = 100
+    """Max number of centres that standard deviations and streams use, because their cost grows with its square."""
     open_share: float = 1e-4
     """Max share of the correction's variance that the centres do not explain at the samples."""
 
@@ -64,6 +65,8 @@ class Correction:
     residual: ResidualKernel
     noise: Array
     """Variance of the noise beside it, (n,) (N·m)²."""
+    a: Array
+    """A of the samples (see `posterior.statistics`) for its weights, (p, p)."""
     errors: Array
     """Squared error of held-out blocks with the correction, divided by that without, (n,); 1 for joints without
     correction."""
@@ -92,6 +95,7 @@ def correct(arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ())
     used, n = ordered.rows(np.unique(evenly)), samples.n_joints
     noise, errors, score = arm.noise_variance.copy(), np.ones(n), np.zeros(used.tau.shape)
     found, blocks, conformal = [JointResidual.none(n)] * n, held_out_blocks(used), None
+    sums = [np.zeros((0, 0))] * n
     if blocks:
         motion, weights = used.motion(), _weights(used)
         inputs, known = residual_inputs(motion), arm.predict(motion)
@@ -100,16 +104,16 @@ def correct(arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ())
         for j, shape in enumerate(fit_shapes(inputs, left, weights, block)):
             if shape.gain < lengthscales.OPTIONS.min_gain_nats and j not in joints:
                 continue
-            fit = JointFit.of(inputs, left[:, j], weights, blocks, shape)
+            fit = JointFit.of(inputs, left[:, j], weights, blocks, shape, float(noise[j]))
             if fit.gains or j in joints:
-                found[j], noise[j] = fit.residual(inputs, float(noise[j]))
-                errors[j] = min(fit.error, 1.0)
-                mean, explained = fit.held_out
-                variance = found[j].variance - explained + noise[j] + known.covariance[:, j, j]
+                found[j], noise[j] = fit.residual(), fit.noise
+                errors[j], sums[j] = min(fit.error, 1.0), fit.few.a
+                mean, variance = fit.held_out
+                variance = variance + noise[j] + known.covariance[:, j, j]
                 half = quantile(LEVEL) * np.sqrt(variance)
                 score[:, j] = np.abs(left[:, j] - mean) / half
         conformal = conformal_of(score, metrics.blocks(used))
-    return Correction(ResidualKernel(found), noise, errors, conformal)
+    return Correction(ResidualKernel(found), noise, block_diagonal(sums), errors, conformal)
 
 
 def _weights(samples: Samples) -> Array:
@@ -173,92 +177,127 @@ class KnownSums:
 
     def mean(self) -> Array:
         """Return the mean of the variables from all samples, (m,)."""
-        return self._factor().solve(self.b)
-
-    def learnt(self) -> Array:
-        """Return the learnt root of their covariance from all samples, (m, m)."""
-        return learnt_root(self._factor().inverse())
-
-    def _factor(self) -> Factor:
         a = self.a.copy()
         add_diagonal(a, 1.0)
-        return cholesky(a)
+        return cholesky(a).solve(self.b)
 
 
 @dataclass(frozen=True)
 class JointFit:
     """Features of a joint's residual at N samples, and the errors of its blocks."""
 
+    scaled: Array
+    """Inputs in lengthscales, (N, 4 n), of float32 numbers."""
     order: Pivots
     """Centres among the samples, with their correlations' Cholesky factor."""
     shape: Shape
     known: KnownSums
     """Posterior from the chosen number of centres."""
     few: KnownSums
-    """Posterior from at most `std_centres` of them."""
+    """Posterior from at most `features` of them, with `variance` and `noise`."""
     held_out: Array
-    """Mean and explained variance at all samples, each block from the others, (2, N)."""
+    """Mean and variance at all samples, each block from the others, (2, N)."""
     gains: bool
     """Whether this reduces the error beyond chance."""
     error: float
     """Squared error with the correction, divided by that without."""
-    stretch: float
-    """Mean square of the errors, divided by their variance; at least 0.01."""
+    variance: float
+    """Variance without data, (N·m)²."""
+    taken: float
+    """Share of what these features leave that the others explain, see `JointResidual`."""
+    noise: float
+    """Variance of the noise, (N·m)²."""
 
     @classmethod
     def of(
-        cls, inputs: Array, values: Array, weights: Array, blocks: Sequence[tuple[slice, SplitRows]], shape: Shape
+        cls,
+        inputs: Array,
+        values: Array,
+        weights: Array,
+        blocks: Sequence[tuple[slice, SplitRows]],
+        shape: Shape,
+        noise: float,
     ) -> JointFit:
         """Return the features of N samples, and the errors of their blocks.
 
-        inputs: (N, 4 n); values: residuals, (N,) N·m; weights: of the samples, (N,); blocks: see `held_out_blocks`.
+        inputs: (N, 4 n); values: residuals, (N,) N·m; weights: of the samples, (N,); blocks: see `held_out_blocks`;
+        noise: of the arm alone, (N·m)². Both variances are scaled to the errors; far from the samples, the torque is as
+        uncertain as the arm's.
         """
-        scaled = inputs / shape.lengthscales
+        scaled = (inputs / shape.lengthscales).astype(np.float32).astype(np.float64)
         order = pivots(np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean")), 1, OPTIONS.sizes[-1], OPTIONS.open_share)
-        features, noise = order.lower * np.sqrt(shape.variance), shape.noise / weights
+        features, white = order.lower * np.sqrt(shape.variance), shape.noise / weights
 
         def errors(predicted: Array | float) -> Array:
             return np.array([np.mean(np.square(values - predicted)[parts.held_out]) for _, parts in blocks])
 
-        known = few = KnownSums.of(features[:, : OPTIONS.sizes[0]], shape.variance, noise, values)
-        predicted, variances = known.predict(blocks)
+        known = few = KnownSums.of(features[:, : OPTIONS.sizes[0]], shape.variance, white, values)
+        predicted, _ = known.predict(blocks)
         for size in OPTIONS.sizes[1:]:
             if known.features.shape[1] == len(order):
                 break
-            larger = KnownSums.of(features[:, :size], shape.variance, noise, values)
-            mean, variance = larger.predict(blocks)
-            if (
-                size > OPTIONS.std_centres
-                and errors(mean).mean() > (1 - OPTIONS.min_progress) * errors(predicted).mean()
-            ):
+            larger = KnownSums.of(features[:, :size], shape.variance, white, values)
+            mean, _ = larger.predict(blocks)
+            if size > OPTIONS.features and errors(mean).mean() > (1 - OPTIONS.min_progress) * errors(predicted).mean():
                 break
             known, predicted = larger, mean
-            if size <= OPTIONS.std_centres:
-                few, variances = larger, variance
+            if size <= OPTIONS.features:
+                few = larger
         without, with_it = errors(0.0), errors(predicted)
         gain = without - with_it
         chance = OPTIONS.min_gain_errors * gain.std(ddof=1) / np.sqrt(len(gain))
+        squares, near = np.square(values - predicted), _nearness(scaled, order.outputs[: len(known.a)], blocks)
         tested = np.any([parts.held_out for _, parts in blocks], axis=0)
-        stretch = max(0.01, float(np.mean((np.square(values - predicted) / (variances + shape.noise))[tested])))
+        _, variances = _taken(few, blocks, shape.noise, squares, near, tested)
+        stretch = max(0.01, float(np.mean((squares / (variances + shape.noise))[tested])))
+        own = stretch * shape.noise
+        variance = max(stretch * shape.variance, noise - own)
+        few = KnownSums.of(few.features * np.sqrt(variance / shape.variance), variance, own / weights, values)
+        taken, variances = _taken(few, blocks, own, squares, near, tested)
         error = float(with_it.mean() / without.mean()) if without.any() else 1.0
         gains = bool(gain.mean() > max(OPTIONS.min_gain * without.mean(), chance))
-        held_out = np.stack([predicted, stretch * (shape.variance - variances)])
-        return cls(order, shape, known, few, held_out, gains, error, stretch)
+        held_out = np.stack([predicted, variances])
+        return cls(scaled, order, shape, known, few, held_out, gains, error, variance, taken, own)
 
-    def residual(self, inputs: Array, noise: float) -> tuple[JointResidual, float]:
-        """Return the residual, and the variance of the noise beside it. noise: variance of the arm's noise."""
-        count, scale = self.known.features.shape[1], np.sqrt(self.shape.variance)
+    def residual(self) -> JointResidual:
+        """Return the residual."""
+        count, few = self.known.features.shape[1], len(self.few.a)
         root = self.order.lower[self.order.outputs[:count], :count]
-        mean, learnt = self.known.mean(), self.few.learnt()
-        few = len(learnt)
-        own = self.stretch * self.shape.noise
-        return (
-            JointResidual(
-                self.shape.lengthscales,
-                inputs[self.order.outputs[:count]],
-                scale * solve_lower(root, mean, transposed=True),
-                np.sqrt(self.stretch) * scale * solve_lower_right(learnt, root[:few, :few]),
-                max(self.stretch * self.shape.variance, noise - own),
-            ),
-            own,
+        return JointResidual(
+            self.shape.lengthscales,
+            self.scaled[self.order.outputs[:count]],
+            np.sqrt(self.shape.variance) * solve_lower(root, self.known.mean(), transposed=True),
+            np.sqrt(self.variance) * solve_lower_right(np.eye(few), root[:few, :few]),
+            self.variance,
+            self.taken,
         )
+
+
+def _nearness(scaled: Array, centres: Indices, blocks: Sequence[tuple[slice, SplitRows]]) -> Array:
+    """Return the largest squared correlation of N samples with a centre that is not held out with them, (N,).
+
+    scaled: inputs in lengthscales, (N, D); centres: their places among the samples.
+    """
+    out = np.empty(len(scaled))
+    for block, parts in blocks:
+        others = scaled[centres[parts.train[centres]]]
+        out[block] = np.exp(-cdist(scaled[block], others, "sqeuclidean").min(axis=1, initial=np.inf))
+    return out
+
+
+def _taken(
+    few: KnownSums,
+    blocks: Sequence[tuple[slice, SplitRows]],
+    noise: float,
+    squares: Array,
+    near: Array,
+    tested: NDArray[np.bool_],
+) -> tuple[float, Array]:
+    """Return the share of what the features leave that the centres explain, and the variances at N samples, (N,).
+
+    squares: squared errors of held-out samples, (N,); near: see `_nearness`; tested: samples with errors, (N,).
+    """
+    variance, open_ = few.predict(blocks)[1], few.beyond * near
+    excess, most = float((variance + noise - squares)[tested].mean()), float(open_[tested].mean())
+    taken = min(max(excess / most, 0.0), 1.0) if most > 0 else 0.0
+    return taken, variance - taken * open_

@@ -69,7 +69,7 @@ def fit_estimator(
             correction = correct(compression.posterior, samples, corrected)
             report |= correction.report()
             estimator = estimator.corrected(correction.residual)
-            posterior = compression.posterior.corrected(estimator.kernel, correction.noise)
+            posterior = compression.posterior.corrected(estimator.kernel, correction.noise, correction.a)
             compression = replace(compression, posterior=posterior)
             if correction.conformal is not None:
                 conformal = conformal.replaced(corrected_joints(report), correction.conformal)

@@ -101,6 +101,11 @@ class DriveKernel(LinearKernel):
         """Return the regressor that computes the terms of single queries."""
         return self.drive.regressor
 
+    def of_joint(self, joint: int) -> NDArray[np.int64]:
+        """Return the places of a joint's weights."""
+        count = len(self.drive.terms)
+        return joint * count + np.arange(count)
+
     def friction(self) -> PartialKernel:
         """Return the part that is friction."""
         return PartialKernel(self, ~self._gains)

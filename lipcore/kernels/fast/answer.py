@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lipcore.kernels.fast.compile import brief, compiled, inlined
 from lipcore.kernels.fast.lanes import LANES, spread
 from lipcore.kernels.fast.play import deflection_std
+from lipcore.kernels.fast.residual import PANEL, multiply_column
 from lipcore.kernels.fast.views import lay, numbers
 
 Array = NDArray[np.float64]
@@ -56,6 +57,30 @@ def multiply(panels: Array, panel: int, columns: Array, first: int, count: int, 
     y[0], y[1], y[2], y[3], y[4], y[5] = a, b, c, d, e, f
 
 
+def pack_joints(slopes: Array, root: Array, places: list[Indices]) -> Array:
+    """Return the means and roots of parts of M variables, one part for each joint, flat.
+
+    slopes: (M,); root: Q, (M, M) lower triangular; places: those of the part among the variables, rising. Each begins
+    with the part's slopes.
+    """
+    parts = [(slopes[each], pack(root_of_part(root, each), 0, PANEL * LANES)) for each in places]
+    return np.concatenate([np.zeros(0), *(each for part in parts for each in part)])
+
+
+def root_of_part(root: Array, places: Indices) -> Array:
+    """Return the lower triangular root, (K, K), of the same squares as Q has on K of its variables.
+
+    root: Q, (M, M) lower triangular; places: (K,), rising.
+    """
+    rows = np.flatnonzero(root[:, places].any(axis=1))
+    if np.isin(rows, places).all():
+        return root[np.ix_(places, places)]
+    upper = np.asarray(np.linalg.qr(root[np.ix_(rows, places[::-1])], mode="r"))
+    lower = np.zeros((len(places),) * 2)
+    lower[len(lower) - len(upper) :] = upper[::-1, ::-1]
+    return lower
+
+
 MISFIT_ROWS = 6
 """Rows of a misfit before those of the play elements."""
 MEAN, STD, COVARIANCE = range(3)  # how much to compute: each value includes the ones before
@@ -86,6 +111,8 @@ def fallback_share(variance: float, usual: float) -> float:
 def answer(
     fixed: Array,
     outputs: Indices,
+    places: Indices,
+    counts: Indices,
     blocks: Array,
     features: Array,
     beyond: Array,
@@ -107,7 +134,9 @@ def answer(
     Return whether any `share` is above zero.
 
     - fixed: the panel of the mean, the panels of the root's rows that are subtracted, one for each output, and the
-      panels of the rows that are added, one for each linear weight;
+      panels of the rows that are added, one for each linear weight; then, if `counts` is not empty, what
+      `pack_joints` returns;
+    - places, counts: (n, most) and (n,), see `pack_joints`, or empty;
     - blocks: (N, S + 1, n, n), from `Cross`;
     - features: (N, P, n), Φᵀ;
     - beyond: (N, n), variance of a torque that the anchors do not change; no reason for the fallback;
@@ -127,8 +156,13 @@ def answer(
     size, groups = chosen + linear, (n + WIDTH - 1) // WIDTH
     step = groups * size * WIDTH
     products = queries * step
-    for query in range(queries):
-        _gather(blocks[query].reshape(-1), outputs, features[query], n, query * step, memory)
+    full, alone = what == COVARIANCE, counts.shape[0] > 0
+    if alone:
+        _torques(fixed, places, counts, features, tau)
+    if full or not alone:
+        for query in range(queries):
+            _gather(blocks[query].reshape(-1), outputs, features[query], n, query * step, memory)
+    for query in range(0 if alone else queries):
         for group in range(groups):
             multiply(fixed, 0, memory, query * step + group * size * WIDTH, size, memory, products)
             for j in range(min(WIDTH, n - group * WIDTH)):
@@ -137,13 +171,15 @@ def answer(
         return False
 
     any_share = False
-    full = what == COVARIANCE
-    for query in range(queries):
-        _begin(blocks[query, -1], full, covariance[query])
-    panel = _add_panels(fixed, ROWS * size, 0, chosen, size, memory, full, covariance)
-    for query in range(queries):
-        _scale(-1.0, full, covariance[query])
-    _add_panels(fixed, panel, chosen, size, size, memory, full, covariance)
+    if full or not alone:
+        for query in range(queries):
+            _begin(blocks[query, -1], full, covariance[query])
+        panel = _add_panels(fixed, ROWS * size, 0, chosen, size, memory, full, covariance)
+        for query in range(queries):
+            _scale(-1.0, full, covariance[query])
+        _add_panels(fixed, panel, chosen, size, size, memory, full, covariance)
+    if alone:
+        _variances(fixed, places, counts, features, memory, covariance)
     for query in range(queries):
         _scale(std_factor * std_factor, full, covariance[query])
         speed, acceleration = 0.0, 0.0
@@ -173,10 +209,67 @@ def _of_elements(misfit: Array, motion: Array, joint: int) -> float:
     return torque * torque
 
 
+@compiled
+def _torques(fixed: Array, places: Indices, counts: Indices, features: Array, tau: Array) -> None:
+    """Write the torques of N queries joint by joint, (N, n). `fixed` ends with the joints' `pack_joints`."""
+    queries, n = tau.shape
+    at = _first_joint(fixed, counts)
+    for j in range(n):
+        for query in range(queries):
+            torque = 0.0
+            for k in range(counts[j]):
+                torque += fixed[at + k] * features[query, places[j, k], j]
+            tau[query, j] = torque
+        at += _packed_size(counts[j])
+
+
+@compiled
+def _variances(
+    fixed: Array, places: Indices, counts: Indices, features: Array, memory: Array, covariance: Array
+) -> None:
+    """Write the variances of N queries' torques on the diagonals of (N, n, n), joint by joint; see `_torques`."""
+    queries, n = covariance.shape[:2]
+    at, learnt = _first_joint(fixed, counts), np.empty(PANEL * LANES)
+    for j in range(n):
+        count = counts[j]
+        for query in range(queries):
+            for k in range(count):
+                memory[k] = features[query, places[j, k], j]
+            panel, left = at + count, 0.0
+            for row in range(0, count, PANEL * LANES):
+                columns = min(row + PANEL * LANES, count)
+                multiply_column(fixed, panel, memory, columns, learnt)
+                for k in range(columns - row):
+                    left += learnt[k] * learnt[k]
+                panel += columns * PANEL * LANES
+            covariance[query, j, j] = left
+        at += _packed_size(count)
+
+
+@inlined
+def _first_joint(fixed: Array, counts: Indices) -> int:
+    """Return where the parts of all joints begin."""
+    at = fixed.shape[0]
+    for count in counts:
+        at -= _packed_size(count)
+    return at
+
+
+@inlined
+def _packed_size(count: int) -> int:
+    """Return the length of a part of `count` variables, see `pack_joints`."""
+    height, size = PANEL * LANES, count
+    for row in range(0, count, height):
+        size += min(row + height, count) * height
+    return size
+
+
 @brief
 def answer_one(
     fixed: Array,
     outputs: Indices,
+    places: Indices,
+    counts: Indices,
     blocks: Array,
     features: Array,
     beyond: Array,
@@ -197,6 +290,8 @@ def answer_one(
     return answer(
         fixed,
         outputs,
+        places,
+        counts,
         blocks,
         features,
         beyond,

@@ -11,11 +11,13 @@ import operator
 from collections.abc import Callable
 from typing import Any, cast
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core.datamodel import models
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, register_model
+from numpy.typing import NDArray
 
 LANES = 8
 """Pairs of samples computed together: two AVX2 registers, or one AVX-512 register."""
@@ -73,5 +75,17 @@ def _spread(_typing: Any, number: Any) -> tuple[Any, Callable[..., Any]]:
     return lanes(number), lambda _context, builder, _signature, arguments: _broadcast(builder, arguments[0])
 
 
+def _widened(_typing: Any, memory: Any, at: Any) -> tuple[Any, Callable[..., Any]]:
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        data = context.make_array(memory)(context, builder, arguments[0]).data
+        narrow = ir.VectorType(ir.FloatType(), LANES)
+        place = builder.bitcast(builder.gep(data, [arguments[1]]), narrow.as_pointer())
+        return builder.fpext(builder.load(place, align=4), _VECTOR)
+
+    return lanes(memory, at), generate
+
+
+widened: Callable[[NDArray[np.float32], int], Lanes] = cast(Any, intrinsic(_widened))
+"""widened(memory, at): Lanes of a flat float32 array from element `at` on."""
 spread: Callable[[float], Lanes] = cast(Any, intrinsic(_spread))
 """Lanes that all contain the same number."""

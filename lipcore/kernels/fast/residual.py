@@ -1,4 +1,4 @@
-"""Compiled mean and variance of the torque that training has learnt beside the arm (see `ResidualKernel`).
+"""Compiled mean and features of the torque that is learnt beside the arm (see `ResidualKernel`).
 
 Centres are stored LANES at a time, rows of roots PANEL Lanes at a time, column by column up to the diagonal.
 """
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lipcore.kernels.fast.compile import compiled, inlined
 from lipcore.kernels.fast.joints import Array
-from lipcore.kernels.fast.lanes import LANES, spread
+from lipcore.kernels.fast.lanes import LANES, spread, widened
 from lipcore.kernels.fast.views import lay
 
 Indices = NDArray[np.int64]
@@ -21,38 +21,43 @@ FAR = 160.0
 """Squared distance, in lengthscales, from which on the correlation is constant: exp(−80)."""
 
 
-def pack_centres(centres: Array) -> Array:
+def pack_centres(centres: Array) -> NDArray[np.float32]:
     """Return centres, (m, D), with the last repeated to fill the Lanes: (G, D, LANES), flat."""
     padded = np.pad(centres, ((0, -len(centres) % LANES), (0, 0)), mode="edge" if len(centres) else "constant")
-    return padded.reshape(-1, LANES, centres.shape[1]).transpose(0, 2, 1).reshape(-1)
+    return padded.reshape(-1, LANES, centres.shape[1]).transpose(0, 2, 1).reshape(-1).astype(np.float32)
 
 
 @compiled
 def residual_torque(
     rates: Array,
-    centres: Array,
+    centres: NDArray[np.float32],
     starts: Indices,
     weights: Array,
     roots: Array,
     sizes: Indices,
     prior: Array,
+    taken: Array,
     sign_width: float,
     motions: Array,
+    features: Array,
+    begin: int,
     mean: Array,
-    variance: Array,
+    beyond: Array,
 ) -> None:
-    """Write the mean torques of N queries and their variances, (N, n) each.
+    """Write the prior means of N queries, (N, n), their features, and the variance that these leave, (N, n).
 
-    rates: (n, 4 n), one over each joint's lengthscales; centres: of all joints, as of `pack_centres`, in units of them;
+    rates: (n, 4 n), one over each joint's lengthscales; centres: of all joints, as of `pack_centres`;
     starts: (n + 1,), where they begin, in Lanes; weights: of all joints, N·m, with zeros to fill the Lanes; roots: of
-    all joints, as of `answer.pack`; sizes: (n,), their numbers of rows; prior: (n,), variance without data; motions:
-    (N, …, n).
+    all joints, as of `answer.pack`; sizes: (n,), their numbers of rows; prior: (n,), variance without data; taken:
+    (n,), see `JointResidual`; motions: (N, …, n); features: (N, …, n), written from row `begin` on, each joint's after
+    those of the joints before it.
     """
-    n = prior.shape[0]
+    n, total = prior.shape[0], np.sum(sizes)
     x, near = np.empty(4 * n), np.empty(LANES * max(1, np.max(starts[1:] - starts[:-1])))
     learnt = np.empty(PANEL * LANES)
     for query in range(motions.shape[0]):
-        panel = 0
+        panel, at = 0, begin
+        features[query, begin : begin + total] = 0.0
         for joint in range(n):
             for other in range(n):
                 for part in range(3):
@@ -60,31 +65,33 @@ def residual_torque(
                 x[3 * n + other] = np.tanh(motions[query, 1, other] / sign_width) * rates[joint, 3 * n + other]
             first, groups = starts[joint], starts[joint + 1] - starts[joint]
             _correlate(centres, first * 4 * n * LANES, x, groups, near)
-            torque = 0.0
+            torque, nearest, explained = 0.0, 0.0, 0.0
             for centre in range(groups * LANES):
                 torque += weights[first * LANES + centre] * near[centre]
-            explained = 0.0
+                nearest = max(nearest, near[centre])
             for row in range(0, sizes[joint], PANEL * LANES):
                 columns = min(row + PANEL * LANES, sizes[joint])
-                _multiply(roots, panel, near, columns, learnt)
-                for at in range(PANEL * LANES):
-                    explained += learnt[at] * learnt[at]
+                multiply_column(roots, panel, near, columns, learnt)
+                for k in range(columns - row):
+                    features[query, at + row + k, joint] = learnt[k]
+                    explained += learnt[k] * learnt[k]
                 panel += columns * PANEL * LANES
+            at += sizes[joint]
             mean[query, joint] = torque
-            variance[query, joint] = max(prior[joint] - explained, 0.0)
+            beyond[query, joint] = max(prior[joint] - explained, 0.0) * (1.0 - taken[joint] * nearest * nearest)
 
 
 @inlined
-def _correlate(centres: Array, at: int, x: Array, groups: int, near: Array) -> None:
+def _correlate(centres: NDArray[np.float32], at: int, x: Array, groups: int, near: Array) -> None:
     """Write exp(−½ |x − z|²) for the centres z of `groups` Lanes, stored from `at` on."""
-    size = x.shape[0]
-    (places,), (out,) = lay(centres, at, ((groups, size),))[0], lay(near, 0, ((groups,),))[0]
+    size, (out,) = x.shape[0], lay(near, 0, ((groups,),))[0]
     for group in range(groups):
         one, two, three, four = spread(0.0), spread(0.0), spread(0.0), spread(0.0)
         for d in range(0, size, 4):
-            a, b = places[group, d] - x[d], places[group, d + 1] - x[d + 1]
-            e, f = places[group, d + 2] - x[d + 2], places[group, d + 3] - x[d + 3]
+            a, b = widened(centres, at) - x[d], widened(centres, at + LANES) - x[d + 1]
+            e, f = widened(centres, at + 2 * LANES) - x[d + 2], widened(centres, at + 3 * LANES) - x[d + 3]
             one, two, three, four = one + a * a, two + b * b, three + e * e, four + f * f
+            at += 4 * LANES
         out[group] = (one + two) + (three + four)
     for centre in range(groups * LANES):
         # Taylor series of exp(−t / 4096), twelve times squared: without calls, the loop is compiled to SIMD
@@ -96,11 +103,11 @@ def _correlate(centres: Array, at: int, x: Array, groups: int, near: Array) -> N
 
 
 @inlined
-def _multiply(roots: Array, panel: int, near: Array, columns: int, out: Array) -> None:
-    """Write the product of the panel that begins at `panel` with the first `columns` numbers of `near`."""
-    (rows,), (y,) = lay(roots, panel, ((columns, PANEL),))[0], lay(out, 0, ((PANEL,),))[0]
+def multiply_column(roots: Array, panel: int, column: Array, count: int, out: Array) -> None:
+    """Write the product of the panel that begins at `panel` with the first `count` numbers of a column."""
+    (rows,), (y,) = lay(roots, panel, ((count, PANEL),))[0], lay(out, 0, ((PANEL,),))[0]
     a = b = c = d = spread(0.0)
-    for k in range(columns):
-        factor = near[k]
+    for k in range(count):
+        factor = column[k]
         a, b, c, d = a + rows[k, 0] * factor, b + rows[k, 1] * factor, c + rows[k, 2] * factor, d + rows[k, 3] * factor
     y[0], y[1], y[2], y[3] = a, b, c, d

@@ -21,12 +21,12 @@ def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
     (N, n); and errors of joints at rest, (N, n), which may break away at any time.
     """
     posterior = carrier.model.posterior
-    noise, misfit = posterior.noise_variance, posterior.misfit
+    noise, misfit = posterior.noise_variance, posterior.row_misfit
     white = np.maximum(noise - misfit.lasting, 1e-3 * noise)
     rest = misfit.at_rest(motion)
-    lasting = misfit.lasting + misfit.variance(motion) - rest
-    known = posterior.basis.known
-    return white, lasting if known is None else lasting + known.moments(motion)[1], rest
+    lasting = misfit.lasting + posterior.misfit.variance(motion) - rest
+    residual = posterior.basis.residual
+    return white, lasting if residual is None else lasting + residual.beyond(motion), rest
 
 
 def likeness(carrier: Carrier, q: Array, dq: Array, speed: float, pose: float) -> Array:

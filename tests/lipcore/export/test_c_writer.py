@@ -28,6 +28,9 @@ from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, PlayState, element_w
 from lipcore.kernels.drive.terms import drive_terms
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
+from lipcore.online.batch import Rows
+from lipcore.online.learner import OnlineModel
+from lipcore.online.transfer import consolidate
 from lipcore.posterior.compression import build_linear
 from lipcore.posterior.misfit import Misfit
 from lipcore.training.fit import fit_estimator
@@ -111,8 +114,9 @@ def evaluate_exactly(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray
     basis, n = posterior.basis, model.n_joints
     features = np.concatenate([each.features(query) for each in basis.linear], axis=2)
     prior = np.concatenate([each.variances(posterior.params) for each in basis.linear])
-    rubbing = np.zeros(features.shape[2] - basis.linear[0].size)
-    centre = np.concatenate([basis.linear[0].prior_weights(), rubbing])
+    means = [each.prior_weights() for each in basis.linear]
+    sizes = [each.regressor().size for each in basis.linear]
+    centre = np.concatenate([np.zeros(size) if mean is None else mean for mean, size in zip(means, sizes, strict=True)])
     fraction = np.frompyfunc(Fraction, 1, 1)
     cross, first = fraction(features) * fraction(prior), len(basis.outputs)
     before = np.zeros(query.q.shape)
@@ -121,13 +125,13 @@ def evaluate_exactly(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray
         inducing = inducing.reshape(first, len(query), n).transpose(1, 2, 0)
         cross = np.concatenate([fraction(inducing), cross], axis=2)
         before = PairKernel.variance(basis.term, posterior.params, query).diagonal(axis1=1, axis2=2)
-    known = np.zeros(query.q.shape)
-    if basis.known is not None:
-        known, before = basis.known.moments(query)
-    tau = (cross @ fraction(posterior.weights) + fraction(features) @ fraction(centre)).astype(float) + known
+    tau = (cross @ fraction(posterior.weights) + fraction(features) @ fraction(centre)).astype(float)
     squares = (cross @ fraction(posterior.root).T) ** 2
     variance = fraction(before) - squares[..., :first].sum(2) + squares[..., first:].sum(2)
     variance = variance.astype(float) * posterior.std_factor**2 + posterior.misfit.variance(query)
+    if basis.residual is not None:
+        tau += basis.residual.mean(query)
+        variance += basis.residual.beyond(query)
     return tau, np.sqrt(np.maximum(variance, posterior.floor))
 
 
@@ -143,12 +147,14 @@ def train_with_energies(kinds: str, seed: int) -> TorqueModel:
 
 
 def train_with_correction(kinds: str, seed: int) -> TorqueModel:
-    """Train an arm with a local correction of its first two joints."""
+    """Train an arm with a local correction of its first two joints, and teach both with a stream."""
     geometry, _, robot = arm(kinds, seed)
     samples = record_motion(robot, 1, 200)
     samples = replace(samples, tau=samples.tau + 0.1 * np.sin(9 * samples.q))
     task = Task(samples, robot.joint_types, OPTIONS)
-    return fit_estimator(task, "rigid-body+local", learn(task, begin=(geometry.canonical(),)), corrected=(0, 1))
+    model = fit_estimator(task, "rigid-body+local", learn(task, begin=(geometry.canonical(),)), corrected=(0, 1))
+    parts = (samples.t, samples.q, samples.dq, samples.ddq, samples.tau + 0.05 * np.cos(9 * samples.q))
+    return consolidate(OnlineModel.start(model).learn(Rows(*parts, np.zeros(len(samples), np.uint8))))
 
 
 def with_misfit(model: TorqueModel) -> TorqueModel:

@@ -1,4 +1,4 @@
-"""Tests of the known residual: its compiled numbers, and the likelihood by which its lengthscales are found."""
+"""Tests of the residual: its compiled numbers, and the likelihood by which its lengthscales are found."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,8 @@ def random_residual(n: int, centres: list[int], rows: list[int]) -> ResidualKern
     for count, size in zip(centres, rows, strict=True):
         root = 0.1 * np.tril(rng.normal(size=(size, size)))
         lengths = rng.uniform(2.0, 4.0, 4 * n)
-        joints.append(JointResidual(lengths, rng.normal(size=(count, 4 * n)), rng.normal(size=count), root, 2.0))
+        places = rng.normal(size=(count, 4 * n)).astype(np.float32).astype(np.float64)
+        joints.append(JointResidual(lengths, places, rng.normal(size=count), root, 2.0, 0.4))
     return ResidualKernel(joints)
 
 
@@ -23,24 +24,29 @@ def random_residual(n: int, centres: list[int], rows: list[int]) -> ResidualKern
 def test_compiled_numbers_match_the_formula(centres, rows):
     n, rng = 3, np.random.default_rng(1)
     kernel, motion = random_residual(n, centres, rows), Motion(*rng.normal(size=(3, 7, n)))
-    mean, variance = kernel.moments(motion)
+    mean, beyond, features = kernel.mean(motion), kernel.beyond(motion), kernel.features(motion)
     inputs = residual_inputs(motion)
     for j, each in enumerate(kernel.joints):
-        apart = (inputs[:, None] - each.centres) / each.lengthscales
+        apart = (inputs / each.lengthscales)[:, None] - each.centres
         near = np.exp(-0.5 * np.square(apart).sum(axis=-1))
         np.testing.assert_allclose(mean[:, j], near @ each.weights, rtol=1e-10, atol=1e-11)
-        learnt = np.square(near[:, : len(each.root)] @ each.root.T).sum(axis=1)
-        np.testing.assert_allclose(variance[:, j], np.maximum(2.0 - learnt, 0.0), rtol=1e-10, atol=1e-11)
-    np.testing.assert_array_equal(kernel.mean(motion), mean)
-    own = kernel.symmetric_gram({}, motion).diagonal().reshape(-1, n)
-    np.testing.assert_allclose(own.clip(0.0), variance, rtol=1e-9, atol=1e-10)
+        expected = near[:, : len(each.root)] @ each.root.T
+        own = kernel.of_joint(j)
+        np.testing.assert_allclose(features[:, j, own], expected, rtol=1e-10, atol=1e-11)
+        assert not np.delete(features[:, j], own, axis=1).any()
+        left = np.maximum(2.0 - np.square(expected).sum(axis=1), 0.0)
+        left *= 1 - 0.4 * np.square(near.max(axis=1, initial=0.0))
+        np.testing.assert_allclose(beyond[:, j], left, rtol=1e-10, atol=1e-11)
+    own = kernel.variance({}, motion).diagonal(axis1=1, axis2=2)
+    np.testing.assert_allclose(own, beyond + np.square(features).sum(axis=2))
+    np.testing.assert_allclose(kernel.symmetric_gram({}, motion).diagonal(), own.reshape(-1))
 
 
 def test_no_torque_far_from_all_centres():
     kernel = random_residual(2, [20, 20], [20, 20])
-    mean, variance = kernel.moments(Motion(np.full((1, 2), 1e6), *np.zeros((2, 1, 2))))
-    np.testing.assert_allclose(mean, 0.0, atol=1e-30)
-    np.testing.assert_allclose(variance, 2.0)
+    far = Motion(np.full((1, 2), 1e6), *np.zeros((2, 1, 2)))
+    np.testing.assert_allclose(kernel.mean(far), 0.0, atol=1e-30)
+    np.testing.assert_allclose(kernel.beyond(far), 2.0)
 
 
 def dense(inputs, values, weights, logs) -> float:

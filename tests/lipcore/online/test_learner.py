@@ -12,8 +12,10 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save
+from lipcore.arm.learning import learn
 from lipcore.data.motion import Motion
 from lipcore.estimators.catalogue import ESTIMATORS
+from lipcore.estimators.task import Task
 from lipcore.files.probing import probe
 from lipcore.online import transfer
 from lipcore.online.batch import Rows
@@ -23,7 +25,8 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.misfit import shared_rows
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Simulation, simulate
-from lipcore.vocabulary import Code
+from lipcore.training.fit import fit_estimator
+from lipcore.vocabulary import LOCAL, Code
 from tests.choosing import few
 from tests.lipcore.arm_oracles import as_rows, assert_same_predictions
 from tests.lipcore.estimators.test_estimators import train_estimator
@@ -45,9 +48,19 @@ def learn_parts(online: OnlineModel, rows: Rows, parts: Iterable[Any], **how: An
     return online
 
 
-@pytest.fixture(scope="module", params=few(ESTIMATORS, {"lip-chain", "se", "rigid-body+lip-chain"}.__contains__))
+@pytest.fixture(scope="module", params=few(ESTIMATORS, {"lip-chain", "se", "rigid-body+lip-chain", LOCAL}.__contains__))
 def model(request: pytest.FixtureRequest) -> TorqueModel:
+    if request.param == LOCAL:
+        return train_correction(simulate_pendulum(1))
     return train_estimator(request.param, simulate_pendulum(1, n_samples=80), OPTIONS)
+
+
+def train_correction(samples: Samples) -> TorqueModel:
+    """Train an arm with a correction of both joints, whether or not they need one."""
+    task = Task(samples, TYPES, OPTIONS)
+    model = fit_estimator(task, LOCAL, learn(task), corrected=(0, 1))
+    assert (model.posterior.basis.residual.sizes > 0).all()
+    return model
 
 
 @pytest.fixture(scope="module")
@@ -173,6 +186,21 @@ def test_learning_equals_the_posterior_of_all_samples(base: TorqueModel, rows: R
     noise = np.concatenate([row_noise(base.posterior, *each) for each in zip(parts, (shared, 10.0), strict=True)])
     expected = regression(base.posterior, motion, tau, noise, np.zeros(len(base.posterior.basis)))
     assert_solution(OnlineModel.start(base).learn(rows), *expected)
+
+
+def test_stream_teaches_arm_and_correction_together(rows: Rows) -> None:
+    base = train_correction(simulate_pendulum(1))
+    posterior, motion = base.posterior, rows.motion()
+    prior, features = posterior.covariance, posterior.basis.features(motion)
+    noise = row_noise(posterior, motion) + open_variance(posterior, motion, features)
+    centre = posterior.basis.root.T @ posterior.weights
+    gain = prior @ features @ np.linalg.inv(features.T @ prior @ features + np.diag(noise))
+    left = (rows.tau - posterior.kernel.mean(motion)).reshape(-1) - features.T @ centre
+    learnt = OnlineModel.start(base).learn(rows)
+    assert_solution(learnt, centre + gain @ left, prior - gain @ features.T @ prior)
+    residual, covariance = posterior.basis.residual, learnt.now.solve().covariance
+    own, others = (posterior.basis.rows(each) for each in (residual, base.estimator.terms["rigid_body"]))
+    assert np.abs(covariance[own, others]).max() > 0.01
 
 
 def test_forgetting_weighs_rows_by_age_around_the_version(base: TorqueModel, rows: Rows) -> None:
