@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +39,21 @@ class JointResidual:
     """Variance without data, (N·m)²."""
     taken: float
     """Share of what the features leave that the training has learnt at the centres, 0 to 1."""
+    fast_weights: Array
+    """`weights` if only the first f centres are used, (f,) N·m, k ≤ f ≤ m."""
+    fast_taken: float
+    """`taken` if only these are used."""
 
     @classmethod
     def none(cls, n: int) -> JointResidual:
         """Return a residual of zero, for one of n joints."""
-        return cls(np.ones(4 * n), np.zeros((0, 4 * n)), np.zeros(0), np.zeros((0, 0)), 0.0, 0.0)
+        return cls(np.ones(4 * n), np.zeros((0, 4 * n)), np.zeros(0), np.zeros((0, 0)), 0.0, 0.0, np.zeros(0), 0.0)
+
+    @property
+    def fast(self) -> JointResidual:
+        """The residual of the first f centres only."""
+        centres = self.centres[: len(self.fast_weights)]
+        return replace(self, centres=centres, weights=self.fast_weights, taken=self.fast_taken)
 
     @property
     def triangle(self) -> Array:
@@ -58,7 +69,8 @@ class ResidualKernel(LinearKernel):
 
     Example: with one centre at rest, and one feature.
 
-    >>> joint = JointResidual(np.ones(4), np.zeros((1, 4)), np.array([2.0]), np.array([[0.5]]), 0.25, 0.0)
+    >>> two = np.array([2.0])
+    >>> joint = JointResidual(np.ones(4), np.zeros((1, 4)), two, np.array([[0.5]]), 0.25, 0.0, two, 0.0)
     >>> rest, far = Motion(*np.zeros((3, 1, 1))), Motion(np.full((1, 1), 10.0), *np.zeros((2, 1, 1)))
     >>> kernel = ResidualKernel([joint])
     >>> [(float(kernel.mean(x)[0, 0].round(6)), float(kernel.beyond(x)[0, 0])) for x in (rest, far)]
@@ -80,6 +92,11 @@ class ResidualKernel(LinearKernel):
             np.array([each.taken for each in joints]),
             SIGN_WIDTH,
         )
+
+    @cached_property
+    def fast(self) -> ResidualKernel:
+        """The kernel with the same features and fewer centres."""
+        return ResidualKernel([each.fast for each in self.joints])
 
     @property
     def prior(self) -> Array:

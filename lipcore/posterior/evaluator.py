@@ -170,6 +170,14 @@ class Evaluator:
             other._falls_back, other._usual = False, np.full_like(self._usual, np.inf)
         return other
 
+    def fast(self) -> Evaluator:
+        """Return the evaluator with fewer centres of a residual, see `ResidualKernel.fast`; this one without any."""
+        if self._residual is None:
+            return self
+        other, (first, kernel) = copy(self), self._residual
+        other._residual = first, kernel.fast
+        return other
+
     def one(
         self, motion: Array, std: bool = True, covariance: Array | None = None
     ) -> tuple[Array, Array | None, Array | None]:

@@ -46,9 +46,11 @@ class CorrectionOptions:
     sizes: tuple[int, ...] = (25, 50, 100, 200, 400, 800, 1500)
     """Numbers of centres that are tried, the fewest first."""
     min_progress: float = 0.02
-    """Min gain of the squared error from more centres than `features`."""
+    """Min gain of the squared error from more centres than `fast`."""
     features: int = 100
     """Max number of centres that standard deviations and streams use, because their cost grows with its square."""
+    fast: int = 200
+    """Max number of centres of fast answers, because the cost of a mean grows with it."""
     open_share: float = 1e-4
     """Max share of the correction's variance that the centres do not explain at the samples."""
 
@@ -70,12 +72,18 @@ class Correction:
     errors: Array
     """Squared error of held-out blocks with the correction, divided by that without, (n,); 1 for joints without
     correction."""
+    fast_errors: Array
+    """The same with fast answers."""
     conformal: Conformal | None
     """Factors on the intervals of corrected joints, from held-out blocks; None if there are none."""
 
     def report(self) -> dict[str, float]:
         """Return the errors of corrected joints, for the manifest."""
-        return {f"{REPORT_PREFIX}{j + 1}": round(float(each), 3) for j, each in enumerate(self.errors) if each < 1}
+        return {
+            f"{prefix}{j + 1}": round(float(errors[j]), 3)
+            for prefix, errors in ((REPORT_PREFIX, self.errors), (f"fast_{REPORT_PREFIX}", self.fast_errors))
+            for j in np.flatnonzero(self.errors < 1).tolist()
+        }
 
 
 def corrected_joints(report: Mapping[str, object]) -> list[int]:
@@ -93,7 +101,8 @@ def correct(arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ())
     count = min(OPTIONS.max_rows, OPTIONS.rows_each * float(_weights(ordered).sum()))
     evenly = np.linspace(0, len(samples) - 1, max(2, round(count))).round().astype(np.int64)
     used, n = ordered.rows(np.unique(evenly)), samples.n_joints
-    noise, errors, score = arm.noise_variance.copy(), np.ones(n), np.zeros(used.tau.shape)
+    noise, score = arm.noise_variance.copy(), np.zeros(used.tau.shape)
+    errors, fast_errors = np.ones((2, n))
     found, blocks, conformal = [JointResidual.none(n)] * n, held_out_blocks(used), None
     sums = [np.zeros((0, 0))] * n
     if blocks:
@@ -107,13 +116,13 @@ def correct(arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ())
             fit = JointFit.of(inputs, left[:, j], weights, blocks, shape, float(noise[j]))
             if fit.gains or j in joints:
                 found[j], noise[j] = fit.residual(), fit.noise
-                errors[j], sums[j] = min(fit.error, 1.0), fit.few.a
+                errors[j], fast_errors[j], sums[j] = min(fit.error, 1.0), fit.fast_error, fit.few.a
                 mean, variance = fit.held_out
                 variance = variance + noise[j] + known.covariance[:, j, j]
                 half = quantile(LEVEL) * np.sqrt(variance)
                 score[:, j] = np.abs(left[:, j] - mean) / half
         conformal = conformal_of(score, metrics.blocks(used))
-    return Correction(ResidualKernel(found), noise, block_diagonal(sums), errors, conformal)
+    return Correction(ResidualKernel(found), noise, block_diagonal(sums), errors, fast_errors, conformal)
 
 
 def _weights(samples: Samples) -> Array:
@@ -193,6 +202,8 @@ class JointFit:
     shape: Shape
     known: KnownSums
     """Posterior from the chosen number of centres."""
+    fast: KnownSums
+    """Posterior from at most `fast` of them."""
     few: KnownSums
     """Posterior from at most `features` of them, with `variance` and `noise`."""
     held_out: Array
@@ -201,10 +212,14 @@ class JointFit:
     """Whether this reduces the error beyond chance."""
     error: float
     """Squared error with the correction, divided by that without."""
+    fast_error: float
+    """The same with `fast`."""
     variance: float
     """Variance without data, (N·m)²."""
     taken: float
     """Share of what these features leave that the others explain, see `JointResidual`."""
+    fast_taken: float
+    """The same with `fast`."""
     noise: float
     """Variance of the noise, (N·m)²."""
 
@@ -231,22 +246,23 @@ class JointFit:
         def errors(predicted: Array | float) -> Array:
             return np.array([np.mean(np.square(values - predicted)[parts.held_out]) for _, parts in blocks])
 
-        known = few = KnownSums.of(features[:, : OPTIONS.sizes[0]], shape.variance, white, values)
+        known = few = fast = KnownSums.of(features[:, : OPTIONS.sizes[0]], shape.variance, white, values)
         predicted, _ = known.predict(blocks)
         for size in OPTIONS.sizes[1:]:
             if known.features.shape[1] == len(order):
                 break
             larger = KnownSums.of(features[:, :size], shape.variance, white, values)
             mean, _ = larger.predict(blocks)
-            if size > OPTIONS.features and errors(mean).mean() > (1 - OPTIONS.min_progress) * errors(predicted).mean():
+            if size > OPTIONS.fast and errors(mean).mean() > (1 - OPTIONS.min_progress) * errors(predicted).mean():
                 break
             known, predicted = larger, mean
-            if size <= OPTIONS.features:
-                few = larger
-        without, with_it = errors(0.0), errors(predicted)
+            few, fast = larger if size <= OPTIONS.features else few, larger if size <= OPTIONS.fast else fast
+        quickly, _ = fast.predict(blocks)
+        without, with_it, with_fast = errors(0.0), errors(predicted), errors(quickly)
         gain = without - with_it
         chance = OPTIONS.min_gain_errors * gain.std(ddof=1) / np.sqrt(len(gain))
-        squares, near = np.square(values - predicted), _nearness(scaled, order.outputs[: len(known.a)], blocks)
+        squares, fast_squares = np.square(values - predicted), np.square(values - quickly)
+        near, fast_near = (_nearness(scaled, order.outputs[: len(each.a)], blocks) for each in (known, fast))
         tested = np.any([parts.held_out for _, parts in blocks], axis=0)
         _, variances = _taken(few, blocks, shape.noise, squares, near, tested)
         stretch = max(0.01, float(np.mean((squares / (variances + shape.noise))[tested])))
@@ -254,22 +270,32 @@ class JointFit:
         variance = max(stretch * shape.variance, noise - own)
         few = KnownSums.of(few.features * np.sqrt(variance / shape.variance), variance, own / weights, values)
         taken, variances = _taken(few, blocks, own, squares, near, tested)
-        error = float(with_it.mean() / without.mean()) if without.any() else 1.0
+        fast_taken, _ = _taken(few, blocks, own, fast_squares, fast_near, tested)
+        error, fast_error = (
+            float(each.mean() / without.mean()) if without.any() else 1.0 for each in (with_it, with_fast)
+        )
         gains = bool(gain.mean() > max(OPTIONS.min_gain * without.mean(), chance))
         held_out = np.stack([predicted, variances])
-        return cls(scaled, order, shape, known, few, held_out, gains, error, variance, taken, own)
+        sums, shares = (known, fast, few), (taken, fast_taken)
+        return cls(scaled, order, shape, *sums, held_out, gains, error, fast_error, variance, *shares, own)
 
     def residual(self) -> JointResidual:
         """Return the residual."""
-        count, few = self.known.features.shape[1], len(self.few.a)
+        count, few = len(self.known.a), len(self.few.a)
         root = self.order.lower[self.order.outputs[:count], :count]
+        weights, fast_weights = (
+            np.sqrt(self.shape.variance) * solve_lower(root[: len(each.a), : len(each.a)], each.mean(), transposed=True)
+            for each in (self.known, self.fast)
+        )
         return JointResidual(
             self.shape.lengthscales,
             self.scaled[self.order.outputs[:count]],
-            np.sqrt(self.shape.variance) * solve_lower(root, self.known.mean(), transposed=True),
+            weights,
             np.sqrt(self.variance) * solve_lower_right(np.eye(few), root[:few, :few]),
             self.variance,
             self.taken,
+            fast_weights,
+            self.fast_taken,
         )
 
 

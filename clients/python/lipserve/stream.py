@@ -67,6 +67,7 @@ class _Stream(StreamSide):
         key: str | None = None,
         scale: bool = False,
         payload: bool = False,
+        rich: bool = False,
     ) -> None:
         headers = headers_of(key)
         address = Address.of(url_of(url))
@@ -74,7 +75,8 @@ class _Stream(StreamSide):
         self._unix = address.unix if unix is None else Path(unix)
         self._exchange = Exchange(stream_id, first_sequence)
         query = {"version": version, "alias": alias, "stream_id": stream_id}
-        query |= {"scale": 1 if scale else None, "payload": 1 if payload else None}
+        flags = {"scale": scale, "payload": payload, "rich": rich}
+        query |= {name: 1 if wanted else None for name, wanted in flags.items()}
         self._destination = destination(address.base, model, **query)
         self._options: dict[str, Any] = {
             "compression": None,
@@ -158,6 +160,7 @@ class StreamClient(_Stream):
         key: As in `Client`.
         scale: Request the factor on the half width of intervals with every answer.
         payload: Request the estimated payload with every answer.
+        rich: Answer from all centres of a correction (`rigid-body+local`), which takes longer.
 
     Raises:
         StreamError: The service cannot be reached or refuses the stream.

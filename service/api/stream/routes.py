@@ -29,6 +29,7 @@ PARAMETERS = {
     "std": ("[01]", "0 or 1"),
     "scale": ("[01]", "0 or 1"),
     "payload": ("[01]", "0 or 1"),
+    "rich": ("[01]", "0 or 1"),
     "stream_id": (STREAM_ID, f"a name that matches {STREAM_ID}"),
     "min_revision": (NUMBER, "a revision of the version"),
 }
@@ -92,7 +93,7 @@ class StreamRoute(EchoRoute):
         served = await wait_for_revision(learners.loaded, model, version, alias, asked.min_revision)
         pinned = version is not None
         meter = scope["app"].state.meters.stream(served.name)
-        given = (served, meter, pinned, asked.std, asked.stream_id, alias, asked.scale, asked.payload)
+        given = (served, meter, pinned, asked.std, asked.stream_id, alias, asked.scale, asked.payload, asked.rich)
         return Session(_connection(scope), receive, send, learners, *given)
 
 
@@ -116,6 +117,7 @@ class StreamParameters(NamedTuple):
     min_revision: int
     scale: bool
     payload: bool
+    rich: bool
 
 
 def _parameters(query: bytes) -> StreamParameters:
@@ -133,8 +135,8 @@ def _parameters(query: bytes) -> StreamParameters:
     version = int(given["version"]) if "version" in given else None
     one_choice(version, given.get("alias"))
     std, revision = given.get("std") == "1", int(given.get("min_revision", 0))
-    scale, payload = given.get("scale") == "1", given.get("payload") == "1"
-    return StreamParameters(version, given.get("alias"), std, given.get("stream_id"), revision, scale, payload)
+    flags = (given.get(name) == "1" for name in ("scale", "payload", "rich"))
+    return StreamParameters(version, given.get("alias"), std, given.get("stream_id"), revision, *flags)
 
 
 def _connection(scope: Scope) -> StreamProtocol:

@@ -194,6 +194,7 @@ class Session(Conversation):
         alias: Alias to follow; None for the serving version.
         scale: Whether every answer includes the factor on the half width of its intervals.
         payload: Whether every answer includes the mass of the payload.
+        rich: Whether answers use all centres of a correction.
     """
 
     def __init__(
@@ -210,6 +211,7 @@ class Session(Conversation):
         alias: str | None = None,
         scale: bool = False,
         payload: bool = False,
+        rich: bool = False,
     ) -> None:
         super().__init__(connection, receive, send, learners.settings)
         self._loaded, self._name = learners.loaded, served.name
@@ -217,6 +219,7 @@ class Session(Conversation):
         self._alias = None if alias == SERVING else alias
         self._sends_std, self._late = std, 0
         self._sends_scale, self._sends_payload, self._stream_id = scale, payload, stream_id
+        self._rich = rich
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
         self._learning = None if stream_id is None else FrameLearning(learners, stream_id, self.send_text)
         self._follower: PlayFollower | None = None  # a session's frames are one motion
@@ -390,4 +393,4 @@ class Session(Conversation):
         """Use the model with the currently known payload."""
         self._payload_model = self._payloads.model_for(self._stream_id)
         model = self._payload_model or self._served.model
-        self._answer = model.answer_fully
+        self._answer = (model if self._rich else model.fast).answer_fully

@@ -49,7 +49,7 @@ def url(request, server) -> str:
 
 def test_answers_match_the_model(driver, server, url, panda):
     motions = panda_rows(20)
-    with Driver(driver, motions, url=url, scale=1, payload=1, **PANDA) as client:
+    with Driver(driver, motions, url=url, scale=1, payload=1, rich=1, **PANDA) as client:
         report = client.do(f"connect {FAR}")
         assert (report["status"], report["first_joint"]) == ("ok", "panda_joint1")
         np.testing.assert_allclose(report["noise_std"], panda.noise_std, rtol=1e-14)

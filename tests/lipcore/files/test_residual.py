@@ -7,6 +7,7 @@ from lipcore.data.motion import Motion
 from lipcore.files.residual import (
     CENTRES,
     COUNTS,
+    FAST_WEIGHTS,
     ROOTS,
     TAKEN,
     VARIANCE,
@@ -22,7 +23,9 @@ from lipcore.kernels.residual import JointResidual, ResidualKernel
 def kernel() -> ResidualKernel:
     rng = np.random.default_rng(0)
     root = 0.1 * np.tril(rng.normal(size=(4, 4)))
-    some = JointResidual(rng.uniform(1, 2, 8), rng.normal(size=(6, 8)), rng.normal(size=6), root, 2.0, 0.5)
+    some = JointResidual(
+        rng.uniform(1, 2, 8), rng.normal(size=(6, 8)), rng.normal(size=6), root, 2.0, 0.5, rng.normal(size=5), 0.3
+    )
     return ResidualKernel([JointResidual.none(2), some])
 
 
@@ -32,8 +35,9 @@ def test_correction_is_read_back(kernel: ResidualKernel) -> None:
     assert check_shapes({name: value.shape for name, value in tensors.items()}, 2) is None
     again = read_residual(tensors)
     assert again is not None
-    for name in ("mean", "beyond", "features"):
-        np.testing.assert_array_equal(getattr(kernel, name)(motion), getattr(again, name)(motion))
+    for before, after in ((kernel, again), (kernel.fast, again.fast)):
+        for name in ("mean", "beyond", "features"):
+            np.testing.assert_array_equal(getattr(before, name)(motion), getattr(after, name)(motion))
     assert read_residual({}) is None
 
 
@@ -41,9 +45,10 @@ def test_correction_is_read_back(kernel: ResidualKernel) -> None:
     ("name", "shape", "message"),
     [
         (CENTRES, (6, 7), "has 'residual/centres' of shape"),
-        (COUNTS, (2, 3), "has 'residual/counts' of shape"),
+        (COUNTS, (2, 2), "has 'residual/counts' of shape"),
         (WEIGHTS, (6, 1), "has 'residual/centres' of shape"),
         (ROOTS, (10, 1), "with several dimensions"),
+        (FAST_WEIGHTS, (5, 1), "with several dimensions"),
         (TAKEN, (3,), "has 'residual/taken' of shape"),
         (VARIANCE, None, "lacks the tensor 'residual/variance'"),
     ],
@@ -58,12 +63,13 @@ def test_wrong_shape_is_named(kernel: ResidualKernel, name: str, shape: tuple[in
 @pytest.mark.parametrize(
     ("counts", "variance", "message"),
     [
-        ([[0, 5], [0, 4]], 2.0, "expected those of residual/weights"),
-        ([[0, 6], [0, 7]], 2.0, "expected those of residual/weights"),
-        ([[7, -1], [0, 0]], 2.0, "expected those of residual/weights"),
-        ([[0, 6], [0, 3]], 2.0, "expected triangles"),
-        ([[0, 6], [0, 4]], -2.0, "a number below zero"),
-        ([[0, 6], [0, 4]], 2.0, "expected shares from 0 to 1"),
+        ([[0, 5], [0, 4], [0, 5]], 2.0, "expected those of residual/weights"),
+        ([[0, 6], [0, 7], [0, 5]], 2.0, "expected those of residual/weights"),
+        ([[7, -1], [0, 0], [5, 0]], 2.0, "expected those of residual/weights"),
+        ([[0, 6], [0, 4], [0, 7]], 2.0, "expected those of residual/weights and residual/fast_weights"),
+        ([[0, 6], [0, 3], [0, 5]], 2.0, "expected triangles"),
+        ([[0, 6], [0, 4], [0, 5]], -2.0, "a number below zero"),
+        ([[0, 6], [0, 4], [0, 5]], 2.0, "expected shares from 0 to 1"),
     ],
 )
 def test_impossible_numbers_are_refused(kernel: ResidualKernel, counts, variance: float, message: str) -> None:

@@ -16,7 +16,11 @@ def random_residual(n: int, centres: list[int], rows: list[int]) -> ResidualKern
         root = 0.1 * np.tril(rng.normal(size=(size, size)))
         lengths = rng.uniform(2.0, 4.0, 4 * n)
         places = rng.normal(size=(count, 4 * n)).astype(np.float32).astype(np.float64)
-        joints.append(JointResidual(lengths, places, rng.normal(size=count), root, 2.0, 0.4))
+        joints.append(
+            JointResidual(
+                lengths, places, rng.normal(size=count), root, 2.0, 0.4, rng.normal(size=max(size, count // 2)), 0.7
+            )
+        )
     return ResidualKernel(joints)
 
 
@@ -40,6 +44,19 @@ def test_compiled_numbers_match_the_formula(centres, rows):
     own = kernel.variance({}, motion).diagonal(axis1=1, axis2=2)
     np.testing.assert_allclose(own, beyond + np.square(features).sum(axis=2))
     np.testing.assert_allclose(kernel.symmetric_gram({}, motion).diagonal(), own.reshape(-1))
+
+
+def test_fast_kernel_has_the_first_centres_and_all_features():
+    rng = np.random.default_rng(2)
+    kernel, motion = random_residual(2, [100, 5], [33, 0]), Motion(*rng.normal(size=(3, 4, 2)))
+    np.testing.assert_allclose(kernel.fast.features(motion), kernel.features(motion), rtol=1e-12)
+    for j, each in enumerate(kernel.joints):
+        apart = (residual_inputs(motion) / each.lengthscales)[:, None] - each.centres[: len(each.fast_weights)]
+        near = np.exp(-0.5 * np.square(apart).sum(axis=-1))
+        np.testing.assert_allclose(kernel.fast.mean(motion)[:, j], near @ each.fast_weights, rtol=1e-10, atol=1e-11)
+        left = (2.0 - np.square(kernel.features(motion)[:, j]).sum(axis=1)).clip(0.0)
+        expected = left * (1 - 0.7 * np.square(near.max(axis=1)))
+        np.testing.assert_allclose(kernel.fast.beyond(motion)[:, j], expected, rtol=1e-10, atol=1e-11)
 
 
 def test_no_torque_far_from_all_centres():

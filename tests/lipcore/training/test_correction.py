@@ -15,6 +15,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
+from lipcore.training import correction
 from lipcore.training.correction import JointFit, corrected_joints, held_out_blocks
 from lipcore.training.lengthscales import Shape
 from lipcore.training.refit import refit, widen_intervals
@@ -123,6 +124,20 @@ def test_correction_leaves_the_arm_unchanged(local_and_arm):
     first = len(local.weights) - len(arm.weights)
     np.testing.assert_allclose(local.weights[first:], arm.weights, rtol=1e-6)
     np.testing.assert_allclose(local.weights[:first], 0.0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_fast_answers_use_fewer_centres_and_state_their_error(local_and_arm, monkeypatch):
+    monkeypatch.setattr(correction, "OPTIONS", replace(correction.OPTIONS, features=25, fast=25))
+    local, again = train_corrected(simulate_ripple()), simulate_ripple(8.0, start=100.0, seed=1)
+    rich, fast, arm = (rmse_per_joint(each, again)[RIPPLED_JOINT] for each in (local, local.fast, local_and_arm[1]))
+    assert rich < 0.8 * fast < 0.8 * arm
+    shares = [local.fit[f"{prefix}local_{RIPPLED_JOINT + 1}"] for prefix in ("", "fast_")]
+    assert shares == pytest.approx(np.square(np.array([rich, fast]) / arm), rel=0.5)
+    assert (predict(local.fast, again).interval.contains(again.tau).mean(axis=0) > 0.9).all()
+    whole = local_and_arm[0]  # all of its centres are few enough
+    np.testing.assert_allclose(predict(whole.fast, again).tau, predict(whole, again).tau, rtol=1e-12)
+    assert local_and_arm[1].fast is local_and_arm[1]
 
 
 @pytest.mark.slow

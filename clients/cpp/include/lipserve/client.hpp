@@ -173,6 +173,7 @@ struct Options {
   unsigned version = 0;             // version number; without version and alias: the serving version
   bool scale = false;               // request the factor on intervals with every answer
   bool payload = false;             // request the estimated payload with every answer
+  bool rich = false;                // answer from all centres of a correction, which takes longer
   /// Sequence of the first frame. The service remembers the sequences of a stream_id: to continue one, start above the
   /// last sequence sent.
   std::uint32_t first_sequence = 1;
@@ -970,6 +971,7 @@ inline bool Client::read_options(const Options& options) {
   if (options.stream_id) ask_for("stream_id").quoted(options.stream_id);
   if (options.scale) ask_for("scale").add('1');
   if (options.payload) ask_for("payload").add('1');
+  if (options.rich) ask_for("rich").add('1');
   request.add(" HTTP/1.1\r\nHost: ").add(host_).add("\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n");
   if (key && *key) request.add("Authorization: Bearer ").add(key).add("\r\n");
   request.add("Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: ");

@@ -25,8 +25,8 @@ class FakeModel:
 
     joint_names, torque_convention, remembers = ("a", "b"), "gravity_included", False
 
-    def __init__(self, factor=1.0):
-        self.factor = factor
+    def __init__(self, factor=1.0, fast=None):
+        self.factor, self.fast = factor, self if fast is None else fast
 
     def position_limits(self, largest):
         return np.full(len(self.joint_names), largest)
@@ -111,6 +111,12 @@ def test_versions_dropped_from_memory_serve_their_streams(versions, pinned, vers
     result = answer_frame(stream_session)
     assert (result.version, result.tau.tolist(), loaded.loads, len(texts)) == (version, tau, version - 1, version - 1)
     assert '"version": 2' in "".join(texts) or version == 1
+
+
+@pytest.mark.parametrize(("rich", "tau"), [(False, [2.0, 4.0]), (True, [1.0, 2.0])])
+def test_answers_are_fast_unless_asked_to_be_rich(rich, tau):
+    stream_session, _ = make_session(FakeVersions(v1=FakeModel(fast=FakeModel(2.0))), 1, rich=rich)
+    assert answer_frame(stream_session).tau.tolist() == tau
 
 
 def test_frames_of_a_session_are_one_motion():
