@@ -92,7 +92,7 @@ Query parameters of the address:
     scale=1       return the scale for every frame: tau ± 1.96 · scale · √(tau_std² + noise_std²) is the 95 % interval
                   of a measurement, by the rows of this stream_id so far, or of all recent streams if it has none
     payload=1     return the payload for every frame; predictions of this stream_id include it in any case
-    rich=1        answer from all centres of a correction, not only from as many as a fast answer allows
+    rich=1        answer from all centres of a correction
     stream_id     stream to learn from: up to 64 letters, digits, dots, underscores and hyphens, a letter or digit first
 
 Flow control. The service stops reading while an answer waits to be written. A client that sends but does not read is
