@@ -13,6 +13,7 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
+from lipcore.kernels.fast.answer import root_of_part
 from lipcore.posterior.evaluator import QUERIES, Evaluator
 from lipcore.robots.library import load_robot
 from lipcore.robots.urdf import RigidBody
@@ -198,6 +199,18 @@ def test_single_query_gives_identical_bits(evaluator_case: Case) -> None:
         assert np.array_equal(one, tau[k])
         assert_close(deviation, std[k])
         assert_close(own[0], between[k])
+
+
+@pytest.mark.parametrize("mixed", [False, True], ids=["own rows", "rows of others"])
+def test_root_of_a_part_has_the_same_squares(mixed: bool) -> None:
+    root = np.tril(np.random.default_rng(0).normal(size=(9, 9)))
+    places = np.array([1, 2, 7, 8])
+    others = np.setdiff1d(np.arange(9), places)
+    if not mixed:
+        root[np.ix_(others, places)] = 0.0
+    part = root_of_part(root, places)
+    assert not np.triu(part, 1).any()
+    np.testing.assert_allclose(part.T @ part, root[:, places].T @ root[:, places], rtol=1e-12, atol=1e-12)
 
 
 def test_negative_variance_gives_zero_std() -> None:
