@@ -2,7 +2,7 @@
 
 Torques of such a term have the covariances c with m torques of inducing samples. They add αᵀ c to the mean and k₁ − |Q₁
 c|² to the variance. Q₂ c is added to the product of the weights' features and their deviations, see `CompactPosterior`.
-The features of a correction are added likewise; what they leave is variance, see `JointResidual`.
+The features of a correction take the place of c. The variance beyond them is added, see `JointResidual`.
 """
 
 from __future__ import annotations

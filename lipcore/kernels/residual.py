@@ -13,7 +13,8 @@ from lipcore.kernels.base import LinearKernel, Params, Regressor, on_last_diagon
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import pack
 from lipcore.kernels.fast.lanes import LANES
-from lipcore.kernels.fast.residual import PANEL, pack_centres, residual_torque
+from lipcore.kernels.fast.residual import pack_centres, residual_torque
+from lipcore.kernels.fast.triangles import HEIGHT
 
 Indices = NDArray[np.int64]
 
@@ -86,7 +87,7 @@ class ResidualKernel(LinearKernel):
             np.concatenate([pack_centres(each.centres) for each in joints]),
             np.cumsum([0, *(len(each) // LANES for each in padded)]).astype(np.int64),
             np.concatenate(padded),
-            np.concatenate([pack(each.root, 0, PANEL * LANES) for each in joints]),
+            np.concatenate([pack(each.root, 0, HEIGHT) for each in joints]),
             self.sizes,
             self.prior,
             np.array([each.taken for each in joints]),

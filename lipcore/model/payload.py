@@ -194,13 +194,9 @@ class Carrier:
         for kernel in posterior.basis.linear:
             if kernel is self.term:
                 continue
-            features, weights = kernel.features(motion), kernel.prior_weights()
             places = posterior.basis.rows(kernel)
-            out[places] = features.transpose(2, 0, 1) * self.root[places][:, None, None]
-            if weights is not None:
-                base += features @ weights
-        if posterior.basis.residual is not None:
-            base += posterior.basis.residual.mean(motion)
+            out[places] = kernel.features(motion).transpose(2, 0, 1) * self.root[places][:, None, None]
+            base += kernel.mean(motion)
         if posterior.basis.term is not None:
             # features of the nonlinear term: its torques are whitened by a root that is not diagonal
             whitened, _ = posterior.basis.features_and_uncovered(motion)

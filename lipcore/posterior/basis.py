@@ -77,7 +77,7 @@ class Basis:
         return self._open(self.prior(query), features)
 
     def prior(self, query: Motion) -> Array:
-        """Return the variance at N queries, (N, n), of the nonlinear term and of what features of a residual leave."""
+        """Return the prior variance at N queries, (N, n), of the nonlinear term and beyond a residual's features."""
         total = np.zeros_like(query.q) if self.residual is None else self.residual.beyond(query)
         if self.term is not None:
             total += self.term.variance(self.params, query).diagonal(axis1=1, axis2=2)

@@ -116,7 +116,7 @@ def correct(arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ())
             fit = JointFit.of(inputs, left[:, j], weights, blocks, shape, float(noise[j]))
             if fit.gains or j in joints:
                 found[j], noise[j] = fit.residual(), fit.noise
-                errors[j], fast_errors[j], sums[j] = min(fit.error, 1.0), fit.fast_error, fit.few.a
+                errors[j], fast_errors[j], sums[j] = min(fit.rich.error, 1.0), fit.fast.error, fit.few.a
                 mean, variance = fit.held_out
                 variance = variance + noise[j] + known.covariance[:, j, j]
                 half = quantile(LEVEL) * np.sqrt(variance)
@@ -192,6 +192,17 @@ class KnownSums:
 
 
 @dataclass(frozen=True)
+class MeanFit:
+    """The mean of a joint's residual from some number of centres."""
+
+    sums: KnownSums
+    error: float
+    """Squared error with it, divided by that without."""
+    taken: float
+    """Share of what `few` features leave that the centres explain, see `JointResidual`."""
+
+
+@dataclass(frozen=True)
 class JointFit:
     """Features of a joint's residual at N samples, and the errors of its blocks."""
 
@@ -200,26 +211,18 @@ class JointFit:
     order: Pivots
     """Centres among the samples, with their correlations' Cholesky factor."""
     shape: Shape
-    known: KnownSums
-    """Posterior from the chosen number of centres."""
-    fast: KnownSums
-    """Posterior from at most `fast` of them."""
+    rich: MeanFit
+    """From the chosen number of centres."""
+    fast: MeanFit
+    """From at most `fast` of them."""
     few: KnownSums
     """Posterior from at most `features` of them, with `variance` and `noise`."""
     held_out: Array
     """Mean and variance at all samples, each block from the others, (2, N)."""
     gains: bool
-    """Whether this reduces the error beyond chance."""
-    error: float
-    """Squared error with the correction, divided by that without."""
-    fast_error: float
-    """The same with `fast`."""
+    """Whether `rich` reduces the error beyond chance."""
     variance: float
     """Variance without data, (N·m)²."""
-    taken: float
-    """Share of what these features leave that the others explain, see `JointResidual`."""
-    fast_taken: float
-    """The same with `fast`."""
     noise: float
     """Variance of the noise, (N·m)²."""
 
@@ -246,46 +249,51 @@ class JointFit:
         def errors(predicted: Array | float) -> Array:
             return np.array([np.mean(np.square(values - predicted)[parts.held_out]) for _, parts in blocks])
 
-        known = few = fast = KnownSums.of(features[:, : OPTIONS.sizes[0]], shape.variance, white, values)
-        predicted, _ = known.predict(blocks)
+        rich = few = fast = KnownSums.of(features[:, : OPTIONS.sizes[0]], shape.variance, white, values)
+        predicted = quickly = rich.predict(blocks)[0]
         for size in OPTIONS.sizes[1:]:
-            if known.features.shape[1] == len(order):
+            if len(rich.a) == len(order):
                 break
             larger = KnownSums.of(features[:, :size], shape.variance, white, values)
-            mean, _ = larger.predict(blocks)
+            mean = larger.predict(blocks)[0]
             if size > OPTIONS.fast and errors(mean).mean() > (1 - OPTIONS.min_progress) * errors(predicted).mean():
                 break
-            known, predicted = larger, mean
-            few, fast = larger if size <= OPTIONS.features else few, larger if size <= OPTIONS.fast else fast
-        quickly, _ = fast.predict(blocks)
-        without, with_it, with_fast = errors(0.0), errors(predicted), errors(quickly)
-        gain = without - with_it
+            rich, predicted = larger, mean
+            if size <= OPTIONS.fast:
+                fast, quickly = larger, mean
+            if size <= OPTIONS.features:
+                few = larger
+        without = errors(0.0)
+        gain = without - errors(predicted)
         chance = OPTIONS.min_gain_errors * gain.std(ddof=1) / np.sqrt(len(gain))
-        squares, fast_squares = np.square(values - predicted), np.square(values - quickly)
-        near, fast_near = (_nearness(scaled, order.outputs[: len(each.a)], blocks) for each in (known, fast))
-        tested = np.any([parts.held_out for _, parts in blocks], axis=0)
-        _, variances = _taken(few, blocks, shape.noise, squares, near, tested)
+        tested, squares = np.any([parts.held_out for _, parts in blocks], axis=0), np.square(values - predicted)
+        near = _nearness(scaled, order.outputs[: len(rich.a)], blocks)
+        variances = few.predict(blocks)[1]
+        open_ = few.beyond * near
+        variances -= _taken(variances + shape.noise - squares, open_, tested) * open_
         stretch = max(0.01, float(np.mean((squares / (variances + shape.noise))[tested])))
         own = stretch * shape.noise
         variance = max(stretch * shape.variance, noise - own)
         few = KnownSums.of(few.features * np.sqrt(variance / shape.variance), variance, own / weights, values)
-        taken, variances = _taken(few, blocks, own, squares, near, tested)
-        fast_taken, _ = _taken(few, blocks, own, fast_squares, fast_near, tested)
-        error, fast_error = (
-            float(each.mean() / without.mean()) if without.any() else 1.0 for each in (with_it, with_fast)
-        )
+        variances = few.predict(blocks)[1]
+
+        def fitted(sums: KnownSums, mean: Array) -> MeanFit:
+            error = float(errors(mean).mean() / without.mean()) if without.any() else 1.0
+            open_ = few.beyond * _nearness(scaled, order.outputs[: len(sums.a)], blocks)
+            return MeanFit(sums, error, _taken(variances + own - np.square(values - mean), open_, tested))
+
+        best, quick = fitted(rich, predicted), fitted(fast, quickly)
         gains = bool(gain.mean() > max(OPTIONS.min_gain * without.mean(), chance))
-        held_out = np.stack([predicted, variances])
-        sums, shares = (known, fast, few), (taken, fast_taken)
-        return cls(scaled, order, shape, *sums, held_out, gains, error, fast_error, variance, *shares, own)
+        held_out = np.stack([predicted, variances - best.taken * few.beyond * near])
+        return cls(scaled, order, shape, best, quick, few, held_out, gains, variance, own)
 
     def residual(self) -> JointResidual:
         """Return the residual."""
-        count, few = len(self.known.a), len(self.few.a)
+        count, few = len(self.rich.sums.a), len(self.few.a)
         root = self.order.lower[self.order.outputs[:count], :count]
         weights, fast_weights = (
             np.sqrt(self.shape.variance) * solve_lower(root[: len(each.a), : len(each.a)], each.mean(), transposed=True)
-            for each in (self.known, self.fast)
+            for each in (self.rich.sums, self.fast.sums)
         )
         return JointResidual(
             self.shape.lengthscales,
@@ -293,9 +301,9 @@ class JointFit:
             weights,
             np.sqrt(self.variance) * solve_lower_right(np.eye(few), root[:few, :few]),
             self.variance,
-            self.taken,
+            self.rich.taken,
             fast_weights,
-            self.fast_taken,
+            self.fast.taken,
         )
 
 
@@ -311,19 +319,10 @@ def _nearness(scaled: Array, centres: Indices, blocks: Sequence[tuple[slice, Spl
     return out
 
 
-def _taken(
-    few: KnownSums,
-    blocks: Sequence[tuple[slice, SplitRows]],
-    noise: float,
-    squares: Array,
-    near: Array,
-    tested: NDArray[np.bool_],
-) -> tuple[float, Array]:
-    """Return the share of what the features leave that the centres explain, and the variances at N samples, (N,).
+def _taken(excess: Array, open_: Array, tested: NDArray[np.bool_]) -> float:
+    """Return the share of `open_` by which variances exceed squared errors, 0 to 1, over the tested of N samples.
 
-    squares: squared errors of held-out samples, (N,); near: see `_nearness`; tested: samples with errors, (N,).
+    excess: variances minus squared errors, (N,); open_: what features leave, times nearness, (N,).
     """
-    variance, open_ = few.predict(blocks)[1], few.beyond * near
-    excess, most = float((variance + noise - squares)[tested].mean()), float(open_[tested].mean())
-    taken = min(max(excess / most, 0.0), 1.0) if most > 0 else 0.0
-    return taken, variance - taken * open_
+    most = float(open_[tested].mean())
+    return min(max(float(excess[tested].mean()) / most, 0.0), 1.0) if most > 0 else 0.0

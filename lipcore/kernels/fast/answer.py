@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lipcore.kernels.fast.compile import brief, compiled, inlined
 from lipcore.kernels.fast.lanes import LANES, spread
 from lipcore.kernels.fast.play import deflection_std
-from lipcore.kernels.fast.residual import PANEL, multiply_column
+from lipcore.kernels.fast.triangles import HEIGHT, multiply_triangle, triangle_size
 from lipcore.kernels.fast.views import lay, numbers
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ def pack_joints(slopes: Array, root: Array, places: list[Indices]) -> Array:
     slopes: (M,); root: Q, (M, M) lower triangular; places: those of the part among the variables, rising. Each begins
     with the part's slopes.
     """
-    parts = [(slopes[each], pack(root_of_part(root, each), 0, PANEL * LANES)) for each in places]
+    parts = [(slopes[each], pack(root_of_part(root, each), 0, HEIGHT)) for each in places]
     return np.concatenate([np.zeros(0), *(each for part in parts for each in part)])
 
 
@@ -220,7 +220,7 @@ def _torques(fixed: Array, places: Indices, counts: Indices, features: Array, ta
             for k in range(counts[j]):
                 torque += fixed[at + k] * features[query, places[j, k], j]
             tau[query, j] = torque
-        at += _packed_size(counts[j])
+        at += counts[j] + triangle_size(counts[j])
 
 
 @compiled
@@ -229,21 +229,18 @@ def _variances(
 ) -> None:
     """Write the variances of N queries' torques on the diagonals of (N, n, n), joint by joint; see `_torques`."""
     queries, n = covariance.shape[:2]
-    at, learnt = _first_joint(fixed, counts), np.empty(PANEL * LANES)
+    at, learnt = _first_joint(fixed, counts), np.empty(places.shape[1] + HEIGHT)
     for j in range(n):
         count = counts[j]
         for query in range(queries):
             for k in range(count):
                 memory[k] = features[query, places[j, k], j]
-            panel, left = at + count, 0.0
-            for row in range(0, count, PANEL * LANES):
-                columns = min(row + PANEL * LANES, count)
-                multiply_column(fixed, panel, memory, columns, learnt)
-                for k in range(columns - row):
-                    left += learnt[k] * learnt[k]
-                panel += columns * PANEL * LANES
+            multiply_triangle(fixed, at + count, memory, count, learnt)
+            left = 0.0
+            for k in range(count):
+                left += learnt[k] * learnt[k]
             covariance[query, j, j] = left
-        at += _packed_size(count)
+        at += count + triangle_size(count)
 
 
 @inlined
@@ -251,17 +248,8 @@ def _first_joint(fixed: Array, counts: Indices) -> int:
     """Return where the parts of all joints begin."""
     at = fixed.shape[0]
     for count in counts:
-        at -= _packed_size(count)
+        at -= count + triangle_size(count)
     return at
-
-
-@inlined
-def _packed_size(count: int) -> int:
-    """Return the length of a part of `count` variables, see `pack_joints`."""
-    height, size = PANEL * LANES, count
-    for row in range(0, count, height):
-        size += min(row + height, count) * height
-    return size
 
 
 @brief

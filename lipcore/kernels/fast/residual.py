@@ -1,6 +1,6 @@
 """Compiled mean and features of the torque that is learnt beside the arm (see `ResidualKernel`).
 
-Centres are stored LANES at a time, rows of roots PANEL Lanes at a time, column by column up to the diagonal.
+Centres are stored LANES at a time, roots as `triangles` says.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from lipcore.kernels.fast.compile import compiled, inlined
 from lipcore.kernels.fast.joints import Array
 from lipcore.kernels.fast.lanes import LANES, spread, widened
+from lipcore.kernels.fast.triangles import HEIGHT, multiply_triangle, triangle_size
 from lipcore.kernels.fast.views import lay
 
 Indices = NDArray[np.int64]
 
-PANEL = 4
-"""Lanes of rows in a panel of the root."""
 FAR = 160.0
 """Squared distance, in lengthscales, from which on the correlation is constant: exp(−80)."""
 
@@ -54,9 +53,9 @@ def residual_torque(
     """
     n, total = prior.shape[0], np.sum(sizes)
     x, near = np.empty(4 * n), np.empty(LANES * max(1, np.max(starts[1:] - starts[:-1])))
-    learnt = np.empty(PANEL * LANES)
+    learnt = np.empty(np.max(sizes) + HEIGHT)
     for query in range(motions.shape[0]):
-        panel, at = 0, begin
+        root, at = 0, begin
         features[query, begin : begin + total] = 0.0
         for joint in range(n):
             for other in range(n):
@@ -69,14 +68,11 @@ def residual_torque(
             for centre in range(groups * LANES):
                 torque += weights[first * LANES + centre] * near[centre]
                 nearest = max(nearest, near[centre])
-            for row in range(0, sizes[joint], PANEL * LANES):
-                columns = min(row + PANEL * LANES, sizes[joint])
-                multiply_column(roots, panel, near, columns, learnt)
-                for k in range(columns - row):
-                    features[query, at + row + k, joint] = learnt[k]
-                    explained += learnt[k] * learnt[k]
-                panel += columns * PANEL * LANES
-            at += sizes[joint]
+            multiply_triangle(roots, root, near, sizes[joint], learnt)
+            for k in range(sizes[joint]):
+                features[query, at + k, joint] = learnt[k]
+                explained += learnt[k] * learnt[k]
+            root, at = root + triangle_size(sizes[joint]), at + sizes[joint]
             mean[query, joint] = torque
             beyond[query, joint] = max(prior[joint] - explained, 0.0) * (1.0 - taken[joint] * nearest * nearest)
 
@@ -100,14 +96,3 @@ def _correlate(centres: NDArray[np.float32], at: int, x: Array, groups: int, nea
         for _ in range(12):
             value *= value
         near[centre] = value
-
-
-@inlined
-def multiply_column(roots: Array, panel: int, column: Array, count: int, out: Array) -> None:
-    """Write the product of the panel that begins at `panel` with the first `count` numbers of a column."""
-    (rows,), (y,) = lay(roots, panel, ((count, PANEL),))[0], lay(out, 0, ((PANEL,),))[0]
-    a = b = c = d = spread(0.0)
-    for k in range(count):
-        factor = column[k]
-        a, b, c, d = a + rows[k, 0] * factor, b + rows[k, 1] * factor, c + rows[k, 2] * factor, d + rows[k, 3] * factor
-    y[0], y[1], y[2], y[3] = a, b, c, d
