@@ -12,7 +12,7 @@ from benchmarks.latency.table import NOTHING, Grid
 from benchmarks.latency.targets import Target
 from benchmarks.real.cells import OWN, PRODUCT, Knowledge, Result
 from benchmarks.real.running import ALONE, WITH_BODY, Outcome
-from benchmarks.real.splits import EARLY, GUARD_S, MAX_TEST_ROWS
+from benchmarks.real.splits import EARLY, GUARD_S, MAX_TEST_ROWS, SECONDS
 
 TEN_S = 9.4
 """Min duration of ten seconds of training; preparation cuts half a second off a recording."""
@@ -169,7 +169,8 @@ def notes(outcome: Outcome) -> list[str]:
     """Return remarks on the tables."""
     lines = [
         f"Tests begin {GUARD_S:g} s after the training samples and have at most {MAX_TEST_ROWS} rows. {EARLY}: the "
-        "first 60 % is for training, the last 30 % for the test. other: another motion.",
+        f"first 60 % is for training, the last 30 % for the test. {SECONDS}: random single seconds, a fifth of the "
+        "recording, are the test. other: another motion.",
         "Width / need: mean half width of the 95 % interval over 1.96 RMSE. Worst joint / mean: largest error of a "
         "joint over the error of the training samples' mean.",
         "Other methods choose their constants on the last quarter of the training samples.",

@@ -1,11 +1,12 @@
-"""Splits of a recording into training and test samples: later rows, or another motion."""
+"""Splits of a recording into training and test samples: later rows, single seconds, or another motion."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.real.recordings import TRAIN, Parts
 from lipcore.data.samples import Array, Samples
@@ -18,6 +19,9 @@ MAX_TEST_ROWS = 2000
 FIRST_S = (5, 10, 30)
 EARLY = "first-60pct"
 """Split of short recordings: training on the first 60 %, test on the last 30 %."""
+SECONDS = "seconds"
+"""Split with single seconds as the test: the training saw the motion before and after them."""
+TEST_SHARE = 0.2
 MAX_SHORT_S = 10.0
 """Max duration of a short recording."""
 
@@ -47,6 +51,7 @@ def splits(parts: Parts) -> tuple[Mapping[str, Split], Mapping[str, str]]:
         else:
             found[name] = Split(train.rows(at < seconds), train.rows(at >= seconds + GUARD_S))
     found["last-30pct"] = Split(train.rows(at < 0.7 * total), train.rows(at >= 0.7 * total + GUARD_S))
+    found[SECONDS] = _hold_out_seconds(train, at)
     if total <= MAX_SHORT_S:
         rows = len(train)
         found[EARLY] = Split(train.rows(slice(0, int(0.6 * rows))), train.rows(slice(round(0.7 * rows), None)))
@@ -54,6 +59,22 @@ def splits(parts: Parts) -> tuple[Mapping[str, Split], Mapping[str, str]]:
         if part != TRAIN:
             found[part] = Split(train, samples)
     return {name: Split(each.train, thinned(each.test)) for name, each in found.items()}, skipped
+
+
+def _hold_out_seconds(samples: Samples, at: Array) -> Split:
+    """Hold out random seconds. Rows closer than GUARD_S to them are in neither part, and each piece is an episode."""
+    second = at.astype(np.int64)
+    count = int(second[-1]) + 1
+    chosen = np.random.default_rng(0).permutation(count)[: max(1, round(TEST_SHARE * count))]
+    held = np.isin(second, chosen)
+    near = np.any([(at > one - GUARD_S) & (at < one + 1 + GUARD_S) for one in chosen], axis=0)
+
+    def part(mask: NDArray[np.bool_]) -> Samples:
+        rows = np.flatnonzero(mask)
+        begins = (np.diff(rows, prepend=rows[0]) > 1) | (np.diff(samples.episode[rows], prepend=0) != 0)
+        return replace(samples.rows(rows), episode=np.cumsum(begins, dtype=np.int64))
+
+    return Split(part(~near), part(held))
 
 
 def elapsed(samples: Samples) -> Array:

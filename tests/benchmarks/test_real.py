@@ -14,7 +14,7 @@ from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, evaluate_forecas
 from benchmarks.real.product import open_bed
 from benchmarks.real.recordings import Recording
 from benchmarks.real.rivals import Forecast
-from benchmarks.real.splits import GUARD_S, MAX_TEST_ROWS, Split, elapsed, splits
+from benchmarks.real.splits import GUARD_S, MAX_TEST_ROWS, SECONDS, Split, elapsed, splits
 from lipcore.data.samples import Samples
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
@@ -100,7 +100,7 @@ def test_mujoco_finds_the_torque_of_a_simulated_robot():
 def test_splits_keep_a_guard_between_training_and_test():
     found, skipped = splits({"train": still(24.0), "other": still(3.0)})
     assert list(skipped) == ["first-30s"]
-    rows = [(name, len(each.train), each.test.q[0, 0]) for name, each in found.items()]
+    rows = [(name, len(each.train), each.test.q[0, 0]) for name, each in found.items() if name != SECONDS]
     guard = 100 * GUARD_S
     assert rows == [
         ("first-5s", 500, 500 + guard),
@@ -111,6 +111,17 @@ def test_splits_keep_a_guard_between_training_and_test():
     assert all(len(each.test) <= MAX_TEST_ROWS for each in found.values())
     early = splits({"train": still(9.0)})[0]["first-60pct"]  # of a short recording
     assert (len(early.train), early.test.q[0, 0], early.test.q[-1, 0]) == (540, 630, 899)
+
+
+def test_single_seconds_are_held_out_with_a_guard():
+    split = splits({"train": still(24.0)})[0][SECONDS]
+    train, test = (each.q[:, 0] for each in (split.train, split.test))
+    assert (len(test), len({*(test // 100)})) == (500, 5)
+    assert np.abs(train[:, None] - test).min() >= 100 * GUARD_S
+    for part in (split.train, split.test):
+        steps, new = np.diff(part.q[:, 0]), np.diff(part.episode)
+        assert ((steps > 1) == (new == 1)).all()
+        assert (new <= 1).all()
 
 
 def test_the_time_between_episodes_does_not_count():
@@ -165,7 +176,7 @@ def test_second_run_computes_nothing(options, monkeypatch):
     assert run(replace(options, compute=False)).results == []
     first = run(options)
     assert {result.cell.method for result in first.results} == {"mean", "least squares", "Bayesian least squares"}
-    assert {result.cell.split for result in first.results} == {"first-5s", "first-10s", "last-30pct"}
+    assert {result.cell.split for result in first.results} == {"first-5s", "first-10s", "last-30pct", SECONDS}
     monkeypatch.setattr(running, "compute_cell", lambda *_: pytest.fail("computed again"))
     assert run(options) == first
 
@@ -174,9 +185,9 @@ def test_run_continues_after_failed_cells(options, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(running.ALONE, "mean", Mock(side_effect=ValueError("no luck")))
         broken = run(options)
-    assert [*broken.failed.values()] == ["ValueError: no luck"] * 3
-    assert len(broken.results) == 6
-    assert len(run(options).results) == 9
+    assert [*broken.failed.values()] == ["ValueError: no luck"] * 4
+    assert len(broken.results) == 8
+    assert len(run(options).results) == 12
 
 
 def test_methods_do_not_see_the_torque_of_the_test(options, monkeypatch):
