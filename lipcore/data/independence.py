@@ -46,6 +46,14 @@ def recording_weights(time: Array, episode: NDArray[np.int64], rate: float = IND
     return np.clip(rate * np.where(np.isfinite(seconds), seconds, np.inf), 0.0, 1.0)
 
 
+def thinned_weights(time: Array) -> Array:
+    """Return the weights of the rows of a thinned table, (N,): each is an episode, so only times count.
+
+    time: (N,) s, in the order of episodes. A time that does not rise starts a new recording.
+    """
+    return recording_weights(time, np.cumsum(np.diff(time, prepend=-np.inf) <= 0, dtype=np.int64))
+
+
 def stream_weights(time: Array, before: float | None = None, rate: float = INDEPENDENT_HZ) -> Array:
     """Return the weight of each row of a stream, (N,), from 0 to 1.
 

@@ -85,9 +85,18 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
 
     Hyperparameters and basis do not change.
     """
-    posterior = model.posterior
+    updated = _learn(model.posterior, sums)
+    spans = {
+        name: {"min": sums.low[at].tolist(), "max": sums.high[at].tolist()}
+        for at, name in enumerate(("q", "dq", "ddq"))
+    }
+    return replace(model, posterior=updated, fit={**model.fit, "samples_posterior": count}, training_range=spans)
+
+
+def _learn(posterior: CompactPosterior, sums: ShardStatistics) -> CompactPosterior:
+    """Return the posterior with the same basis from other sums."""
     statistics = Statistics(unpack_symmetric("a", sums.a), sums.b, sums.weight)
-    updated = CompactPosterior.build(
+    return CompactPosterior.build(
         posterior.kernel,
         posterior.basis,
         statistics,
@@ -95,11 +104,11 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
         posterior.std_factor,
         posterior.misfit,
     )
-    spans = {
-        name: {"min": sums.low[at].tolist(), "max": sums.high[at].tolist()}
-        for at, name in enumerate(("q", "dq", "ddq"))
-    }
-    return replace(model, posterior=updated, fit={**model.fit, "samples_posterior": count}, training_range=spans)
+
+
+def condition_arm(posterior: CompactPosterior, samples: Samples, weights: Array) -> CompactPosterior:
+    """Return an arm's posterior from samples with weights, (N,), instead of the few that its fit has chosen."""
+    return _learn(posterior, sum_samples(Summing.of(posterior), samples, weights))
 
 
 def condition(

@@ -9,7 +9,7 @@ import numpy as np
 
 from lipcore.arm.learning import ArmFit, learn
 from lipcore.arm.search import known_geometries
-from lipcore.data.independence import motion_dimensions
+from lipcore.data.independence import motion_dimensions, thinned_weights
 from lipcore.data.samples import Samples
 from lipcore.estimators.catalogue import Estimator, calibrate, check_estimator, make_estimator
 from lipcore.estimators.hyperparameters import FitProgress, fit
@@ -17,6 +17,7 @@ from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
 from lipcore.kernels.base import Params
 from lipcore.kernels.geometry import Geometry
+from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.parameters import passing_friction
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.compact import CompactPosterior
@@ -24,6 +25,7 @@ from lipcore.posterior.compression import Compression, build_linear, compress_sa
 from lipcore.posterior.conformal import Conformal, fit_conformal
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.statistics import collect
+from lipcore.training.conditioning import condition_arm, should_condition
 from lipcore.training.correction import correct, corrected_joints
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
@@ -33,13 +35,13 @@ def fit_estimator(
     name: str,
     learnt: ArmFit | None = None,
     geometries: Sequence[Geometry] = (),
-    corrected: Sequence[int] = (),
+    before: ResidualKernel | None = None,
 ) -> TorqueModel:
     """Train one estimator on the samples of a task.
 
     name: one of `lipcore.estimators.catalogue.ESTIMATORS`; learnt: rigid bodies learnt from these samples before.
     Estimators without rigid bodies read the uncertainty of friction at rest from them; geometries: first starts of a
-    search, base to tip; corrected: joints that an earlier fit has corrected. Raise ValueError like `check_estimator`,
+    search, base to tip; before: correction by an earlier fit. Raise ValueError like `check_estimator`,
     FitCancelledError, or NotPositiveDefiniteError.
     """
     samples, types, options = task.samples, task.joint_types, task.options
@@ -66,10 +68,13 @@ def fit_estimator(
         if name == LOCAL:
             if task.on_progress is not None:
                 task.on_progress(FitProgress("posterior", 0, 0, float(learnt.report["objective"]), 0.0, 0.0))
-            correction = correct(compression.posterior, samples, corrected)
+            arm, weights = compression.posterior, thinned_weights(samples.t)
+            if should_condition(options, len(samples), float(weights.sum())):
+                arm = condition_arm(arm, samples, weights)  # the correction must not learn what the arm can
+            correction = correct(arm, samples, before)
             report |= correction.report()
             estimator = estimator.corrected(correction.residual)
-            posterior = compression.posterior.corrected(estimator.kernel, correction.noise, correction.a)
+            posterior = arm.corrected(estimator.kernel, correction.noise, correction.a)
             compression = replace(compression, posterior=posterior)
             if correction.conformal is not None:
                 conformal = conformal.replaced(corrected_joints(report), correction.conformal)

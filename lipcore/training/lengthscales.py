@@ -6,7 +6,9 @@ motion.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize
@@ -20,13 +22,15 @@ from lipcore.kernels.fast.neighbours import Indices, likelihood_given_neighbours
 class LengthscaleOptions:
     """Size of the search for lengthscales.
 
-    Tuned on random splits of the SARCOS test file with 300, 1000 and 3000 rows, and on `schunk`.
+    Tuned on random splits of the SARCOS test file with 300, 1000 and 3000 rows, on `schunk`, and on a simulated Panda.
     """
 
     max_rows: int = 1500
-    """Max number of samples whose likelihood is computed. All are neighbours."""
+    """Max number of samples whose likelihood is computed."""
     neighbours: int = 30
     """Max number of neighbours of a sample."""
+    first_iterations: int = 10
+    """Max iterations from each start. The likeliest result is improved."""
     rounds: int = 2
     """Searches, each with the neighbours by the lengthscales of the one before."""
     iterations: int = 40
@@ -37,8 +41,10 @@ class LengthscaleOptions:
     """The same of log s² around the log of the mean square: far from all samples, a residual is of usual size."""
     noise_std: float = 3.0
     """The same of the log of the noise."""
-    starts: tuple[tuple[float, float], ...] = ((1.0, 0.1), (1.0, 0.5))
-    """Factors on these starts, with shares of the noise in the variance; the likeliest is used."""
+    starts: tuple[tuple[float, ...], ...] = ((1.0, 1.0, 1.0, 1.0), (0.2, 0.2, 0.2, 0.2), (1.0, 0.1, 0.1, 1.0))
+    """Factors on the starts of the joint's own inputs q, dq, ddq and tanh. Friction depends on them the most."""
+    noise_shares: tuple[float, ...] = (0.1, 0.5)
+    """Shares of the noise in the variance of a start; the likelier is used."""
     min_gain_nats: float = 10.0
     """Min gain of the likelihood over noise alone. If it is less, the search ends early."""
     longest: float = 1.4
@@ -65,22 +71,35 @@ class Shape:
     """Gain of the likelihood over noise alone, nats."""
 
 
-def fit_shapes(inputs: Array, residual: Array, weights: Array, block: Indices) -> list[Shape]:
+def fit_shapes(
+    inputs: Array, residual: Array, weights: Array, block: Indices, begin: Sequence[Array | None]
+) -> list[Shape]:
     """Return the most likely hyperparameters of each joint, given N samples.
 
     inputs: (N, D); residual: (N, n) N·m; weights: (N,), see `data.independence.recording_weights`; block: (N,), part of
-    the recording; neighbours are of another one.
+    the recording; neighbours are of another one; begin: (n,), lengthscales of an earlier fit, (D,) each; one search
+    improves them.
     """
     order = np.random.default_rng(0).permutation(len(inputs))
     spread = np.maximum(inputs.std(axis=0), 1e-9) * np.sqrt(inputs.shape[1])
     search = _Search(inputs[order] / spread, weights[order], block[order])
-    first = search.neighbours(np.zeros(inputs.shape[1]))
     out = []
-    for column in residual[order].T:
+    for joint, column in enumerate(residual[order].T):
         power = float(np.mean(column**2)) or 1.0
-        logs, gain = search.fit(column / np.sqrt(power), first)
+        starts = _starts(joint, residual.shape[1]) if begin[joint] is None else [np.log(begin[joint] / spread)]
+        logs, gain = search.fit(column / np.sqrt(power), starts)
         variance, noise = (power * np.exp(logs[-2:])).tolist()
         out.append(Shape(np.exp(logs[:-2]) * spread, variance, noise, gain))
+    return out
+
+
+def _starts(joint: int, n: int) -> list[Array]:
+    """Return log ℓ of the starts for one of n joints, in units of the spread."""
+    out = []
+    for factors in OPTIONS.starts:
+        logs = np.zeros(len(factors) * n)
+        logs[joint::n] = np.log(factors)
+        out.append(logs)
     return out
 
 
@@ -92,53 +111,65 @@ class _Search:
     weights: Array
     block: Indices
 
-    @property
-    def first(self) -> int:
-        """The first sample whose likelihood is computed."""
-        return max(0, len(self.block) - OPTIONS.max_rows)
+    @cached_property
+    def rows(self) -> Indices:
+        """Samples whose likelihood is computed: of many, the fewer the later, so that neighbours are near and far."""
+        size, most = len(self.block), OPTIONS.max_rows
+        if size <= 2 * most:
+            return np.arange(max(0, size - most), size)
+        return np.unique(np.geomspace(most, size - 1, most).astype(np.int64))
 
     def neighbours(self, log_lengthscales: Array) -> Indices:
-        """Return the nearest samples before each one from `first` on, of other blocks; −1 where there are fewer."""
+        """Return the nearest samples before each of `rows`, of other blocks; −1 where there are fewer."""
         scaled, size = self.inputs * np.exp(-log_lengthscales), len(self.block)
         count = min(OPTIONS.neighbours, max(1, size - 1))
-        out = np.empty((size - self.first, count), np.int64)
-        for first in range(self.first, size, 500):
-            rows = np.arange(first, min(first + 500, size))
+        out = np.empty((len(self.rows), count), np.int64)
+        for first in range(0, len(self.rows), 100):
+            rows = self.rows[first : first + 100]
             distance = cdist(scaled[rows], scaled, "sqeuclidean")
             distance[self.block[rows, None] == self.block] = np.inf
             distance[np.arange(size) >= rows[:, None]] = np.inf
             nearest = np.argpartition(distance, count - 1, axis=1)[:, :count]
             unknown = ~np.isfinite(np.take_along_axis(distance, nearest, axis=1))
             nearest[unknown] = -1
-            out[rows - self.first] = np.take_along_axis(nearest, np.argsort(unknown, axis=1, kind="stable"), axis=1)
+            out[first : first + 100] = np.take_along_axis(nearest, np.argsort(unknown, axis=1, kind="stable"), axis=1)
         return out
 
-    def fit(self, values: Array, neighbours: Indices) -> tuple[Array, float]:
-        """Return log ℓ, log s² and log r of the values, (N,), which have a mean square of one, and `Shape.gain`."""
-        size, rows = self.inputs.shape[1], np.arange(self.first, len(values))
-        centre = np.zeros(size + 2)
+    def fit(self, values: Array, starts: list[Array]) -> tuple[Array, float]:
+        """Return log ℓ, log s² and log r of values, (N,), which have a mean square of one, and `Shape.gain`.
+
+        starts: log ℓ, (D,) each. A single one is improved by one search.
+        """
+        size, rows = self.inputs.shape[1], self.rows
         width = np.array([*[OPTIONS.prior_std] * size, OPTIONS.variance_std, OPTIONS.noise_std])
+        bounds = [(-5.0, float(np.log(OPTIONS.longest)))] * size + [(-12.0, 5.0), (np.log(OPTIONS.least_noise), 3.0)]
         slopes = np.empty(size + 2)
 
-        def objective(logs: Array) -> tuple[float, Array]:
-            arrays = self.inputs, values, self.weights, rows, neighbours, logs, slopes
-            off = (logs - centre) / width
-            return likelihood_given_neighbours(*arrays) + 0.5 * float(off @ off), slopes + off / width
+        def descend(starts: list[Array], iterations: int) -> tuple[float, Array]:
+            neighbours = self.neighbours(starts[0][:size])
 
-        starts = [
-            np.array([*[np.log(factor)] * size, np.log(1 - share), np.log(share)]) for factor, share in OPTIONS.starts
+            def objective(logs: Array) -> tuple[float, Array]:
+                arrays = self.inputs, values, self.weights, rows, neighbours, logs, slopes
+                off = logs / width
+                return likelihood_given_neighbours(*arrays) + 0.5 * float(off @ off), slopes + off / width
+
+            start = min(starts, key=lambda each: objective(each)[0])
+            options = {"maxiter": iterations, "maxcor": 30, "ftol": 1e-6}
+            found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            return float(found.fun), np.asarray(found.x)
+
+        ends = [
+            descend(
+                [np.array([*logs, np.log(1 - share), np.log(share)]) for share in OPTIONS.noise_shares],
+                OPTIONS.first_iterations if len(starts) > 1 else OPTIONS.iterations,
+            )
+            for logs in starts
         ]
-        logs = min(starts, key=lambda start: objective(start)[0])
-        bounds = [(-5.0, float(np.log(OPTIONS.longest)))] * size + [(-12.0, 5.0), (np.log(OPTIONS.least_noise), 3.0)]
+        value, logs = min(ends, key=lambda end: end[0])
         weights, squares = self.weights[rows], np.square(values[rows])
         variance = max(float(weights @ squares) / float(weights.sum()), 1e-12)
-        alone, gain = 0.5 * float(weights.sum()) * (1 + np.log(variance)), np.inf
-        for again in range(OPTIONS.rounds):
-            if gain < OPTIONS.min_gain_nats:
-                break
-            if again:
-                neighbours = self.neighbours(logs[:size])
-            options = {"maxiter": OPTIONS.iterations, "maxcor": 30, "ftol": 1e-6}
-            found = minimize(objective, logs, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            logs, gain = found.x, alone - float(found.fun)
-        return np.asarray(logs), gain
+        alone = 0.5 * float(weights.sum()) * (1 + np.log(variance))
+        for _ in range(OPTIONS.rounds if len(starts) > 1 else 0):
+            if alone - value >= OPTIONS.min_gain_nats:
+                value, logs = descend([logs], OPTIONS.iterations)
+        return logs, alone - value

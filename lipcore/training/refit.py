@@ -6,13 +6,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lipcore.arm.learning import learn
+from lipcore.arm.learning import ArmFit, learn
 from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Samples
 from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress
 from lipcore.estimators.task import Task
 from lipcore.model.selection import Selection, shortened
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
+from lipcore.posterior.misfit import shared_rows
 from lipcore.posterior.selection import spread_out
 from lipcore.training.correction import corrected_joints
 from lipcore.training.fit import compact, fit_estimator
@@ -53,7 +54,7 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
         learnt = learn(task, begin=model.arm.geometries)
         searched = {key: value for key, value in model.fit.items() if key.startswith("search_")}
         learnt = replace(learnt, report={**learnt.report, **searched})
-        again = fit_estimator(task, name, learnt, corrected=corrected_joints(model.fit))
+        again = fit_estimator(task, name, learnt, before=model.posterior.basis.residual)
         again = replace(again, selection=model.selection)
         if name == RIGID and model.selection is not None:
             again = _choose_corrected(again, model.selection, fit_estimator(task, LOCAL, learnt))
@@ -63,6 +64,23 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
     kept["seconds"] = float(model.fit["seconds"]) + time.monotonic() - began
     again = replace(again, fit={**again.fit, **kept})
     return _widen(again, [float(kept.get(f"{WIDENED_PREFIX}{joint + 1}", 1.0)) for joint in range(model.n_joints)])
+
+
+def relearn(model: TorqueModel, task: Task) -> TorqueModel:
+    """Return the model with weights learnt from the samples of a task; geometry, drive and hyperparameters stay.
+
+    It takes less time than `refit`. Raise like `refit`.
+    """
+    name, before, samples = model.estimator.name, model.posterior, task.samples
+    if name not in (RIGID, LOCAL):
+        return _with_posterior_of(model, task)
+    assert model.arm is not None  # these estimators have an arm
+    rows = spread_out(samples.motion(), task.options.posterior_samples)
+    shared = shared_rows(samples, task.joint_types, len(rows))
+    variance = before.misfit.of_row(before.noise_variance, samples.rows(rows).motion(), shared)
+    report = {"objective": model.fit["objective"]}
+    learnt = ArmFit(model.arm, dict(before.params), rows, before.noise_variance / variance, before.misfit, report)
+    return fit_estimator(task, name, learnt, before=before.basis.residual)
 
 
 def _choose_corrected(arm: TorqueModel, before: Selection, local: TorqueModel) -> TorqueModel:

@@ -15,6 +15,7 @@ from lipcore.data.metrics import evaluate
 from lipcore.data.samples import Samples
 from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
+from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
 from lipcore.online.batch import Rows
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Simulation, simulate
@@ -173,3 +174,12 @@ def assert_same_predictions(one: TorqueModel, other: TorqueModel, rows: Rows, to
     np.testing.assert_allclose(a.tau, b.tau, rtol=0, atol=tolerance * np.abs(b.tau).max())
     # variances are differences of large numbers, limited by rounding
     np.testing.assert_allclose(a.tau_std**2, b.tau_std**2, rtol=1e-6, atol=tolerance * (b.tau_std**2).max())
+
+
+def correction_before(samples: Samples, joints: Sequence[int]) -> ResidualKernel:
+    """Return an earlier correction of some joints, so that a fit corrects them whether or not they need it."""
+    inputs, none = residual_inputs(samples.motion()), JointResidual.none(samples.n_joints)
+    lengthscales = np.sqrt(inputs.shape[1]) * inputs.std(axis=0).clip(1e-3)
+    weights = np.ones(1)
+    one = JointResidual(lengthscales, inputs[:1] / lengthscales, weights, np.eye(1), 1.0, 0.0, weights, 0.0)
+    return ResidualKernel([one if joint in joints else none for joint in range(samples.n_joints)])

@@ -39,7 +39,13 @@ from tests import ROOT
 from tests.choosing import few, slow
 from tests.clients.cpp.building import sanitizers
 from tests.lipcore.arm.test_model import with_alternatives
-from tests.lipcore.arm_oracles import arm, record_motion, reversed_pendulum_model, train_from_geometry
+from tests.lipcore.arm_oracles import (
+    arm,
+    correction_before,
+    record_motion,
+    reversed_pendulum_model,
+    train_from_geometry,
+)
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen")
 ORIGIN = ModelOrigin("an-arm", 3, 7, "0123")
@@ -152,7 +158,8 @@ def train_with_correction(kinds: str, seed: int) -> TorqueModel:
     samples = record_motion(robot, 1, 200)
     samples = replace(samples, tau=samples.tau + 0.1 * np.sin(9 * samples.q))
     task = Task(samples, robot.joint_types, OPTIONS)
-    model = fit_estimator(task, "rigid-body+local", learn(task, begin=(geometry.canonical(),)), corrected=(0, 1))
+    before = correction_before(samples, (0, 1))
+    model = fit_estimator(task, "rigid-body+local", learn(task, begin=(geometry.canonical(),)), before=before)
     parts = (samples.t, samples.q, samples.dq, samples.ddq, samples.tau + 0.05 * np.cos(9 * samples.q))
     return consolidate(OnlineModel.start(model).learn(Rows(*parts, np.zeros(len(samples), np.uint8))))
 

@@ -28,7 +28,7 @@ from lipcore.robots.simulation import Payload, Simulation, simulate
 from lipcore.training.fit import fit_estimator
 from lipcore.vocabulary import LOCAL, Code
 from tests.choosing import few
-from tests.lipcore.arm_oracles import as_rows, assert_same_predictions
+from tests.lipcore.arm_oracles import as_rows, assert_same_predictions, correction_before
 from tests.lipcore.estimators.test_estimators import train_estimator
 
 ROBOT, TYPES = "double-pendulum", ("revolute",) * 2
@@ -58,7 +58,7 @@ def model(request: pytest.FixtureRequest) -> TorqueModel:
 def train_correction(samples: Samples) -> TorqueModel:
     """Train an arm with a correction of both joints, whether or not they need one."""
     task = Task(samples, TYPES, OPTIONS)
-    model = fit_estimator(task, LOCAL, learn(task), corrected=(0, 1))
+    model = fit_estimator(task, LOCAL, learn(task), before=correction_before(samples, (0, 1)))
     assert (model.posterior.basis.residual.sizes > 0).all()
     return model
 

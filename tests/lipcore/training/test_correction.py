@@ -1,6 +1,7 @@
 """Tests of the local correction: its kernel, where it is learnt, and that the arm stays unchanged."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
-from lipcore.training import correction
-from lipcore.training.correction import JointFit, corrected_joints, held_out_blocks
+from lipcore.training import correction, lengthscales, residual_fit
+from lipcore.training.correction import corrected_joints, held_out_blocks
 from lipcore.training.lengthscales import Shape
-from lipcore.training.refit import refit, widen_intervals
+from lipcore.training.refit import refit, relearn, widen_intervals
+from lipcore.training.residual_fit import JointFit
 from lipcore.training.train import fit_model
 
 ARM, TYPES = "finger-edu", ("revolute",) * 3
@@ -29,7 +31,7 @@ PERIOD = 4.0
 NOISE = 5e-4
 
 
-def simulate_ripple(seconds=40.0, ripple=0.02, start=0.0, seed=0) -> Samples:
+def simulate_ripple(seconds=40.0, ripple=0.02, start=0.0, seed=0, noise=NOISE) -> Samples:
     """Simulate a motion that repeats, with a ripple in one joint's torque."""
     robot, t = load_robot(ARM), start + np.arange(0.0, seconds, 0.05)
     rates = 2 * np.pi / PERIOD * np.array([[1, 2, 3], [2, 1, 1]])
@@ -37,7 +39,7 @@ def simulate_ripple(seconds=40.0, ripple=0.02, start=0.0, seed=0) -> Samples:
     sizes = np.array([[0.5, 0.4, 0.3], [0.2, 0.3, 0.3]])
     q, dq = (sizes * np.sin(phases)).sum(1), (sizes * rates * np.cos(phases)).sum(1)
     ddq = -(sizes * rates**2 * np.sin(phases)).sum(1)
-    tau = inverse_dynamics(robot, q, dq, ddq) + NOISE * np.random.default_rng(seed).standard_normal(q.shape)
+    tau = inverse_dynamics(robot, q, dq, ddq) + noise * np.random.default_rng(seed).standard_normal(q.shape)
     tau[:, RIPPLED_JOINT] += ripple * np.sin(12 * q[:, RIPPLED_JOINT])
     return Samples(robot.joint_names, t, np.zeros(len(t), np.int64), q, dq, ddq, tau)
 
@@ -95,7 +97,7 @@ def test_correction_of_one_joint_is_that_of_a_dense_gaussian_process():
     inputs, values = residual_inputs(samples.motion()), np.sin(5 * samples.q[:, 0])
     weights = np.random.default_rng(0).uniform(0.3, 1.0, len(values))
     shape = Shape(np.full(12, 1.5), 0.8, 0.02, 100.0)
-    fit = JointFit.of(inputs, values, weights, held_out_blocks(samples), shape, noise=0.0)
+    fit = JointFit.of(inputs, values, weights, held_out_blocks(samples), shape, 0.0, np.arange(len(values)))
     joint, stretch = fit.residual(), fit.noise / shape.noise
     queries = simulate_ripple(4.0, start=17.0).motion()
     gram, cross = (
@@ -106,12 +108,67 @@ def test_correction_of_one_joint_is_that_of_a_dense_gaussian_process():
     none = JointResidual.none(3)
     kernel = ResidualKernel([joint, none, none])
     mean, features = kernel.mean(queries), kernel.features(queries)[:, 0]
-    learnt = np.linalg.solve(np.eye(len(fit.few.a)) + fit.few.a, features.T)
+    learnt = np.linalg.solve(np.eye(len(fit.a)) + fit.a, features.T)
     variance = kernel.beyond(queries)[:, 0] + np.einsum("ij,ji->i", features, learnt)
     expected = cross @ np.linalg.solve(noisy, values)
     np.testing.assert_allclose(mean[:, 0], expected, atol=2e-3)  # OPTIONS.open_share of the variance is left out
     left = 0.8 - np.einsum("ij,ji->i", cross, np.linalg.solve(noisy, cross.T))
     np.testing.assert_allclose(variance, stretch * left, atol=2e-3 * stretch)
+
+
+def test_sums_of_chunks_are_those_of_all_samples(monkeypatch):
+    samples = simulate_ripple(15.0)
+    inputs, values = residual_inputs(samples.motion()), np.sin(5 * samples.q[:, 0])
+    shape = Shape(np.full(12, 1.5), 0.8, 0.02, 100.0)
+    every = np.arange(len(values))
+
+    def fit() -> JointFit:
+        return JointFit.of(inputs, values, np.ones(len(values)), held_out_blocks(samples), shape, 0.0, every[::2])
+
+    whole = fit()
+    monkeypatch.setattr(residual_fit, "CHUNK", 7)
+    pieces = fit()
+    assert set(whole.centres.rows) <= set(every[::2])
+    np.testing.assert_allclose(pieces.a, whole.a, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(pieces.held_out, whole.held_out, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(pieces.residual().weights, whole.residual().weights, rtol=1e-3, atol=1e-3)
+
+
+def test_correction_learns_more_rows_than_its_centres_are_chosen_from(monkeypatch):
+    samples, again = simulate_ripple(noise=0.01), simulate_ripple(8.0, start=100.0, noise=0.0)
+    monkeypatch.setattr(lengthscales, "OPTIONS", replace(lengthscales.OPTIONS, max_rows=150))
+    errors = []
+    for rows in (800, 100):
+        small = replace(correction.OPTIONS, max_rows=rows, max_candidates=100, max_shape_rows=400)
+        monkeypatch.setattr(correction, "OPTIONS", small)
+        local = train_corrected(samples)
+        assert len(local.posterior.basis.residual.joints[RIPPLED_JOINT].weights) <= 100
+        errors.append(rmse_per_joint(local, again)[RIPPLED_JOINT])
+    assert errors[0] < 0.7 * errors[1]
+
+
+@pytest.mark.slow
+def test_refit_starts_at_the_lengthscales_of_the_fit_before(local_and_arm, monkeypatch):
+    samples, local = simulate_ripple(), local_and_arm[0]
+    search = Mock(side_effect=lengthscales.minimize)
+    monkeypatch.setattr(lengthscales, "minimize", search)
+    refit(local, make_task(samples))
+    inputs = residual_inputs(samples.motion())
+    before = local.posterior.basis.residual.joints[RIPPLED_JOINT].lengthscales
+    expected = np.log(before / (inputs.std(axis=0) * np.sqrt(inputs.shape[1])))
+    starts = [call.args[1][:-2] for call in search.call_args_list]
+    assert sum(np.allclose(start, expected) for start in starts) == 1
+    assert len(starts) == 1 + 2 * len(lengthscales.OPTIONS.starts)  # the other joints have no residual
+
+
+@pytest.mark.slow
+def test_relearning_needs_the_ripple_to_be_seen(local_and_arm):
+    samples, again = simulate_ripple(), simulate_ripple(8.0, start=100.0, seed=1)
+    whole, few = (relearn(local_and_arm[0], make_task(samples.rows(slice(rows)))) for rows in (800, 40))
+    for model in (whole, relearn(local_and_arm[1], make_task(samples))):
+        before = local_and_arm[0] if model is whole else local_and_arm[1]
+        assert rmse_per_joint(model, again) == pytest.approx(rmse_per_joint(before, again), rel=0.05)
+    assert rmse_per_joint(few, again)[RIPPLED_JOINT] > 5 * rmse_per_joint(whole, again)[RIPPLED_JOINT]
 
 
 def test_corrected_intervals_keep_their_coverage(local_and_arm):
@@ -128,7 +185,7 @@ def test_correction_leaves_the_arm_unchanged(local_and_arm):
 
 @pytest.mark.slow
 def test_fast_answers_use_fewer_centres_and_state_their_error(local_and_arm, monkeypatch):
-    monkeypatch.setattr(correction, "OPTIONS", replace(correction.OPTIONS, features=25, fast=25))
+    monkeypatch.setattr(residual_fit, "OPTIONS", replace(residual_fit.OPTIONS, features=25, fast=25))
     local, again = train_corrected(simulate_ripple()), simulate_ripple(8.0, start=100.0, seed=1)
     rich, fast, arm = (rmse_per_joint(each, again)[RIPPLED_JOINT] for each in (local, local.fast, local_and_arm[1]))
     assert rich < 0.8 * fast < 0.8 * arm
