@@ -317,6 +317,8 @@ def print_held_out(version: VersionRecord) -> None:
     out.print(figures_table(f"{counted(held['samples'], 'held-out sample')}", version.joint_names, held))
     if held.get("learnt"):
         echo("  Evaluated on held-out rows; the version was then trained on all rows.")
+    if (curve := held.get("learning_curve")) is not None:
+        echo(f"  {curve['text']}")
     print_warnings(held.get("warnings", ()))
 
 

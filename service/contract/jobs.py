@@ -143,8 +143,8 @@ class JobProgress(BaseModel):
     """Progress of a job."""
 
     stage: str = Field(
-        description="waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, all_rows, saving "
-        "or done. `all_rows` is the final fit, held-out rows included"
+        description="waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, learning_curve, "
+        "all_rows, saving or done. `all_rows` is the final fit, held-out rows included"
     )
     estimator: str | None = Field(None, description="Estimator in training, if `auto` trains several")
     iteration: int = 0

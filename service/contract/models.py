@@ -366,6 +366,27 @@ class HeldOutBlocks(BaseModel):
         return self
 
 
+class CurvePoint(BaseModel):
+    """Error of a fit on held-out samples after training on some samples."""
+
+    model_config = ConfigDict(strict=True)
+
+    rows: int = Field(ge=0, lt=2**63, description="Training samples")
+    spread: bool = Field(description="Whether they are spread over the recordings; else they are the first ones")
+    nmse: float = Field(ge=0, allow_inf_nan=False, description="Squared error / variance of the torque, mean of joints")
+
+
+class LearningCurve(BaseModel):
+    """Error of the evaluated fit against the number of its training samples."""
+
+    model_config = ConfigDict(strict=True)
+
+    points: list[CurvePoint] = Field(min_length=1, max_length=100, description="By number of samples; the last has all")
+    more_helps: bool = Field(description="Whether more samples of the same motion reduce the error beyond chance")
+    variety_helps: bool = Field(description="Whether other motion reduces the error beyond chance")
+    text: str = Field(max_length=300, description="The conclusion, in a sentence or two")
+
+
 class HoldoutLineage(BaseModel):
     """Held-out part of a training, in the lineage of its version.
 
@@ -384,3 +405,6 @@ class HoldoutLineage(BaseModel):
         {}, max_length=10_000, description="If `learnt`: quality of the evaluated fit on the held-out part, by data set"
     )
     blocks: HeldOutBlocks | None = Field(None, description="If `learnt`: scores with which a later version is compared")
+    learning_curve: LearningCurve | None = Field(
+        None, description="Learning curve; null for a refresh, or if the training has too few effective samples"
+    )

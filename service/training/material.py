@@ -37,7 +37,7 @@ from service.training.table import Table, TablePart, open_parts
 
 MAX_REFRESH_SAMPLES = 200_000
 """Maximum logged samples that a refresh learns from."""
-MAX_CANDIDATE_ROWS = 20_000
+MAX_CANDIDATE_ROWS = 50_000
 """Maximum rows that a fit selects its samples from; more are thinned evenly."""
 
 
@@ -269,4 +269,5 @@ def _aged(row: DatasetRow, within: Scope) -> float:
 
 def _holdout(lineage: HoldoutLineage | None) -> dict[str, Any]:
     """Return the split for a lineage, without the entries that need the fit."""
-    return {} if lineage is None else {"holdout": lineage.model_dump(mode="json", exclude={"evaluations", "blocks"})}
+    later = {"evaluations", "blocks", "learning_curve"}
+    return {} if lineage is None else {"holdout": lineage.model_dump(mode="json", exclude=later)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from lipcore.data.samples import Samples
@@ -14,6 +14,7 @@ from lipcore.model.selection import MAX_NAME, shortened
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
 from lipcore.training.conditioning import should_condition
+from lipcore.training.learning_curve import learning_curve
 from lipcore.training.refit import refit, widen_intervals
 from lipcore.training.train import fit_model
 from lipcore.vocabulary import JointType
@@ -76,7 +77,16 @@ class PlannedFit:
             why = shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]
             return replace(judged, fit={**judged.fit, REFIT_ERROR: why})
 
-    def _task(self, on_progress: Progress, heartbeat: Heartbeat) -> Task:
+    def learning_curve(self, judged: TorqueModel, held_out: Samples, heartbeat: Heartbeat) -> dict[str, Any] | None:
+        """Return the learning curve of the judged model for its lineage; None if it cannot be computed."""
+        try:
+            curve = learning_curve(judged, self._task(None, heartbeat), held_out)
+        except (ArithmeticError, ValueError):
+            logger.exception("the learning curve failed; the version has none")
+            return None
+        return None if curve is None else {**asdict(curve), "text": curve.text}
+
+    def _task(self, on_progress: Progress | None, heartbeat: Heartbeat) -> Task:
         data = self.data
         return Task(
             data.samples,

@@ -141,6 +141,9 @@ def _version(
         lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(trained, data)}
     judged_on = _judged_on(data)
     judged = _judged(settings, database, files, claim, data, trained, judged_on, lineage)
+    if data.held_out is not None and judged_on is not None and claim.request.get("refresh") is None:
+        heartbeat.stage("learning_curve")
+        lineage["holdout"]["learning_curve"] = fit.learning_curve(trained, judged_on, heartbeat)
     learnt = data
     if last is not None and judged_on is not None:
         trained = last.last(settings, trained, judged_on, heartbeat)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.data.outliers import CorruptRows
+from service.contract.models import HoldoutLineage
 from service.datasets import staging
 from service.training.pulse import Heartbeat
 from tests.service.data import (
@@ -105,9 +106,25 @@ def test_fraction_done_never_falls(api, run_here, monkeypatch, statistics, passe
     assert fractions == sorted(fractions)
     assert fractions[-1] < 1
     stages = [*dict.fromkeys(each["stage"] for each in seen)]
-    assert stages == ["loading", "hyperparameters", "posterior", *passes, "evaluating", "all_rows", "saving"]
+    end = ["evaluating", "learning_curve", "all_rows", "saving"]
+    assert stages == ["loading", "hyperparameters", "posterior", *passes, *end]
     fit = version_of(api, model)["fit"]
     assert (fit["samples_given"], fit["samples_posterior"]) == (150, learnt)
+
+
+def test_version_keeps_its_learning_curve(api):
+    dataset = upload(api, stream(samples=300, seed=6))["id"]
+    train(api, "curved", dataset, options=QUICK, holdout={"share": 0.3})
+    stored = version_of(api, "curved")["lineage"]["holdout"]
+    held_out = HoldoutLineage.model_validate(stored)
+    curve = held_out.learning_curve
+    assert curve is not None
+    rows = [point.rows for point in curve.points]
+    assert rows == sorted(rows)
+    assert rows[-1] == held_out.judged_rows
+    assert [point.spread for point in curve.points] == [True, True, False, True]
+    assert curve.points[-1].nmse == pytest.approx(np.mean(stored["nmse"]), rel=0.01)
+    assert "samples" in curve.text
 
 
 def test_convention_and_options_of_the_job_are_kept(api):

@@ -164,6 +164,18 @@ def test_selection_by_auto_is_shown_with_job_and_version(visitor: Visitor, dashb
         assert audit(page) == []
 
 
+def test_learning_curve_is_shown_with_job_and_version(visitor: Visitor, dashboard: Dashboard) -> None:
+    dataset = upload(dashboard.client, stream(samples=300, seed=6), name="curved.npz")
+    job = train(dashboard.client, "curved", dataset["id"], holdout={"share": 0.3})
+    for page in (visitor.open(f"#/jobs/{job['id']}"), visitor.open("#/models/curved?tab=lineage")):
+        card = page.get_by_role("region", name="Learning curve")
+        expect(card.get_by_role("img", name=re.compile("^nMSE against rows: .* with "))).to_be_visible()
+        expect(card.locator("tbody tr")).to_have_count(4)
+        expect(card.get_by_role("cell", name="the first ones")).to_be_visible()
+        visitor.settled()
+        assert audit(page) == []
+
+
 def test_model_page_opens_with_the_held_out_part(visitor: Visitor, dashboard: Dashboard, model: str, long: str) -> None:
     assert dashboard.client.get("/v1/datasets").json()["items"][0]["id"] != dashboard.dataset["id"], (
         "a newer one is there"

@@ -52,8 +52,8 @@ class Refresh(Record, frozen=True, kw_only=True):
 class JobProgress(Record, frozen=True, kw_only=True):
     """Progress of a job.
 
-    stage: waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, all_rows, saving or done.
-        `all_rows` is the final fit, held-out rows included
+    stage: waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, learning_curve, all_rows,
+        saving or done. `all_rows` is the final fit, held-out rows included
     estimator: Estimator in training, if `auto` trains several
     objective: Penalised negative log evidence, nats; decreases during the fit
     remaining_s: Estimated remaining time, s; null until it is known. It assumes all iterations, but fits often converge

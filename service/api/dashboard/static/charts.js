@@ -75,6 +75,24 @@ export function innovationCourse(names, course, seconds, now, bucket) {
   );
 }
 
+/** Plot errors against rows, both on logarithmic scales that start at the smallest value. */
+export function errorCurve(rows, errors) {
+  const [x, y] = [scale(rows, 1, 99), scale(errors, 39, 1)];
+  const label = `nMSE against rows: ${rows.map((each, index) => `${nmse(errors[index])} with ${each}`).join(", ")}`;
+  return h(
+    "svg",
+    { class: "course", role: "img", "aria-label": label, viewBox: "0 0 100 40", preserveAspectRatio: "none" },
+    h("title", {}, label),
+    h("path", { d: `M${rows.map((each, index) => `${x(each).toFixed(2)} ${y(errors[index]).toFixed(2)}`).join("L")}`, stroke: jointVar(0) }),
+  );
+}
+
+/** Return the map of values, on a logarithmic scale, to a range of numbers; its middle if all are equal. */
+function scale(values, first, last) {
+  const [low, high] = [Math.log(Math.min(...values)), Math.log(Math.max(...values))];
+  return (value) => (high > low ? first + ((last - first) * (Math.log(value) - low)) / (high - low) : (first + last) / 2);
+}
+
 /** Return the mean of the known values; null if there are none. */
 export function mean(values) {
   const there = (values ?? []).filter(isKnown);

@@ -7,6 +7,7 @@ import { count, nmse, number, percent, shortNames } from "../../format.js";
 import { card, link, table } from "../../ui.js";
 import { warningBanner } from "../data/prose.js";
 import { coverageInterval, narrowJoints } from "../model/coverage.js";
+import { learningCurveCard } from "../model/learning_curve.js";
 import { promotionNote } from "../model/promotion.js";
 import { selectionCard } from "../model/selection.js";
 import { HELD_OUT_NOTE } from "./words.js";
@@ -51,7 +52,7 @@ async function versionResult(job, signal) {
       : h("p", { class: "banner" }, "Nothing was held out, so the quality is unknown. Evaluate the version on a recording that it was not trained on."),
     !held?.nmse && trained?.nmse ? figures(`On ${count(trained.samples)} training samples: these figures are optimistic`, trained, version) : null,
   );
-  return [made, selectionCard(version)];
+  return [made, selectionCard(version), learningCurveCard(version)];
 }
 
 function servingNote(job, { promotion }) {

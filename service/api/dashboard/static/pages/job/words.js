@@ -13,6 +13,7 @@ const STAGES = {
   posterior: "computing the posterior",
   statistics: "computing statistics of all rows",
   evaluating: "evaluating on the held-out part",
+  learning_curve: "training on fewer rows for the learning curve",
   all_rows: "training on all rows",
   saving: "saving the version",
   done: "done",

@@ -4,6 +4,7 @@ import { h, replace } from "../../dom.js";
 import { bytes, count, number, percent, scientific, seconds, shortNames, when } from "../../format.js";
 import { badge, card, facts, link, table } from "../../ui.js";
 import { heldOut, HELD_OUT_NOTE } from "../job/words.js";
+import { learningCurveCard } from "./learning_curve.js";
 import { selectionCard } from "./selection.js";
 
 /** Draw the tab. */
@@ -13,6 +14,7 @@ export async function lineage(view, { version, datasets }) {
     view,
     card(`Version ${version.version}`, facts(origin(version))),
     selectionCard(version),
+    learningCurveCard(version),
     dataCard(from, datasets),
     figuresCard(version, from),
     card("Fit", facts(fit(version)), version.fit.converged === false ? h("p", { class: "banner" }, "The fit did not converge. More iterations may improve the model.") : null),
