@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import blas, eigh, lapack
 
 from lipcore.data.motion import Array
 
 JITTERS = (0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8)
 """Values added to the diagonal, relative to its mean, in the order of the attempts."""
+Real = TypeVar("Real", np.float64, np.float32)
 _blas, _lapack = cast(Any, blas), cast(Any, lapack)  # f2py modules have no types
 
 
@@ -92,12 +94,13 @@ def solve_lower_right(left: Array, lower: Array) -> Array:
     return solve_lower(lower, left.T, transposed=True).T
 
 
-def whiten_rows(lower: Array, rows: Array) -> None:
-    """Overwrite each row x of `rows`, (K, m), by L⁻¹ x. rows: in C order."""
-    if not rows.flags.c_contiguous:
-        raise ValueError("rows are not C-contiguous, expected an array that BLAS can write to in place")
+def whiten_rows(lower: NDArray[Real], rows: NDArray[Real]) -> None:
+    """Overwrite each row x of `rows`, (K, m), by L⁻¹ x. Both are of float64 or float32 numbers; rows: in C order."""
+    if not rows.flags.c_contiguous or lower.dtype != rows.dtype:
+        raise ValueError("rows are not C-contiguous or of another type, expected an array that BLAS can write to")
     if rows.size:
-        _blas.dtrsm(1.0, lower.T, rows.T, side=0, lower=0, trans_a=1, overwrite_b=1)
+        solve = _blas.dtrsm if rows.dtype == np.float64 else _blas.strsm
+        solve(1.0, lower.T, rows.T, side=0, lower=0, trans_a=1, overwrite_b=1)
 
 
 def solve_factored(lower: Array, right: Array) -> Array:

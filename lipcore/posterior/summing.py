@@ -93,13 +93,12 @@ class Summing:
         basis, first = self.basis, len(self.basis.outputs)
         if basis.term is not None:
             gram = basis.term.gram(basis.params, motion, basis.inducing)
-            np.take(gram, basis.outputs, axis=1, out=out[:, :first], mode="clip")
+            chosen = np.take(gram, basis.outputs, axis=1, mode="clip")
+            whiten_rows(basis.root[:first, :first], chosen)
+            out[:, :first] = chosen
         for each in basis.linear:
-            rows, variances = each.flat_features(motion), each.variances(basis.params)
-            columns = slice(first, first + len(variances))
-            np.multiply(rows, variances, out=out[:, columns])
-            first = columns.stop
-        whiten_rows(basis.root, out)
+            columns = basis.rows(each)
+            np.multiply(each.flat_features(motion), basis.scales[columns], out=out[:, columns])
 
     def _elsewhere(self, total: Total, samples: Samples, weights: Array) -> Array:
         motion = samples.motion()

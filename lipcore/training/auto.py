@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from lipcore.estimators.task import Task
 from lipcore.model.selection import Candidate, HeldOut, plain, selection, unevaluated_candidate
 from lipcore.model.torque_model import TorqueModel
 from lipcore.training.choice import HeldOutSamples, choose_estimator
-from lipcore.training.correction import corrected_joints
+from lipcore.training.correction import correct, corrected_joints
 from lipcore.training.fit import fit_estimator
 from lipcore.training.held_out import HoldOut, hold_out
 from lipcore.training.refit import refit, widen_intervals
@@ -39,6 +40,8 @@ PLACES = {
     "few": (0, 1),
 }
 """Range of each fit within the whole work, as fractions."""
+COMPARED_ROWS = 10_000
+"""Max rows of a correction that is compared with other estimators. The chosen estimator learns all."""
 FAILURES = (ArithmeticError, ValueError)
 """Errors of an estimator on unsuitable samples."""
 
@@ -135,7 +138,7 @@ class FitContext:
         task = replace(self.task, samples=samples, on_progress=self.overall.of(name, place))
         if name not in ROBOT_ESTIMATORS:
             task = replace(task, robot=None, sibling=None)
-        return fit_estimator(task, name, learnt)
+        return fit_estimator(task, name, learnt, correct=partial(correct, max_rows=COMPARED_ROWS))
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from lipcore.posterior.conformal import Conformal, conformal_of
 from lipcore.posterior.linalg import block_diagonal
 from lipcore.training import lengthscales
 from lipcore.training.lengthscales import fit_shapes
-from lipcore.training.residual_fit import JointFit
+from lipcore.training.residual_fit import JointFit, learn_weights
 
 
 @dataclass(frozen=True)
@@ -82,22 +82,21 @@ def corrected_joints(report: Mapping[str, object]) -> list[int]:
     return [int(key.removeprefix(REPORT_PREFIX)) - 1 for key in report if key.startswith(REPORT_PREFIX)]
 
 
-def correct(arm: CompactPosterior, samples: Samples, before: ResidualKernel | None = None) -> Correction:
+def correct(
+    arm: CompactPosterior, samples: Samples, before: ResidualKernel | None = None, max_rows: float = np.inf
+) -> Correction:
     """Return a correction of an arm's residuals of N samples.
 
-    before: correction by an earlier fit. Its joints are corrected in any case, and its lengthscales are the start. If
-    the recording is too short for held-out blocks, no joint is corrected.
+    before: correction by an earlier fit. Its joints are corrected in any case, and its lengthscales are the start;
+    max_rows: max rows to learn. If the recording is too short for held-out blocks, no joint is corrected.
     """
-    ordered = samples.rows(np.lexsort((samples.t, samples.episode)))
-    count = min(OPTIONS.max_rows, OPTIONS.rows_each * float(thinned_weights(ordered.t).sum()))
-    used, n = ordered.rows(_evenly(len(samples), count)), samples.n_joints
+    used, n = _used_rows(samples, max_rows), samples.n_joints
     noise, score = arm.noise_variance.copy(), np.zeros(used.tau.shape)
     errors, fast_errors = np.ones((2, n))
     found, blocks, conformal = [JointResidual.none(n)] * n, held_out_blocks(used), None
     sums = [np.zeros((0, 0))] * n
     if blocks:
-        motion, weights = used.motion(), thinned_weights(used.t)
-        inputs, known = residual_inputs(motion), arm.predict(motion)
+        weights, inputs, known = thinned_weights(used.t), residual_inputs(used.motion()), arm.predict(used.motion())
         left = used.tau - known.mean
         earlier = [JointResidual.none(n)] * n if before is None else before.joints
         begin = [each.lengthscales if len(each.centres) else None for each in earlier]
@@ -112,14 +111,38 @@ def correct(arm: CompactPosterior, samples: Samples, before: ResidualKernel | No
                 continue
             fit = JointFit.of(inputs, left[:, j], weights, blocks, shape, float(noise[j]), candidates)
             if fit.gains or begin[j] is not None:
-                found[j], noise[j] = fit.residual(), fit.noise
-                errors[j], fast_errors[j], sums[j] = min(fit.rich.error, 1.0), fit.fast.error, fit.a
+                found[j], noise[j], sums[j] = fit.residual(), fit.noise, fit.a
+                errors[j], fast_errors[j] = min(fit.share(fit.rich), 1.0), fit.share(fit.fast)
                 mean, variance = fit.held_out
                 variance = variance + noise[j] + known.covariance[:, j, j]
                 half = quantile(LEVEL) * np.sqrt(variance)
                 score[:, j] = np.abs(left[:, j] - mean) / half
     conformal = conformal_of(score, metrics.blocks(used))
     return Correction(ResidualKernel(found), noise, block_diagonal(sums), errors, fast_errors, conformal)
+
+
+def relearn(arm: CompactPosterior, samples: Samples, before: ResidualKernel, noise: Array) -> Correction:
+    """Return a correction by an earlier fit with weights learnt from samples; its centres and variances stay.
+
+    noise: variance of the noise beside it, (n,) (N·m)². Errors are not estimated.
+    """
+    used = _used_rows(samples)
+    weights, inputs = thinned_weights(used.t), residual_inputs(used.motion())
+    left = used.tau - arm.mean(used.motion())
+    found, sums = [], []
+    for j, joint in enumerate(before.joints):
+        learnt = learn_weights(joint, inputs, left[:, j], weights, float(noise[j])) if len(joint.centres) else None
+        found.append(joint if learnt is None else learnt[0])
+        sums.append(np.zeros((0, 0)) if learnt is None else learnt[1])
+    unknown = np.ones(len(noise))
+    return Correction(ResidualKernel(found), noise, block_diagonal(sums), unknown, unknown, None)
+
+
+def _used_rows(samples: Samples, max_rows: float = np.inf) -> Samples:
+    """Return the rows that weights are learnt from, in order."""
+    ordered = samples.rows(np.lexsort((samples.t, samples.episode)))
+    count = min(OPTIONS.max_rows, max_rows, OPTIONS.rows_each * float(thinned_weights(ordered.t).sum()))
+    return ordered.rows(_evenly(len(samples), count))
 
 
 def _evenly(size: int, count: float) -> Indices:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -17,7 +17,6 @@ from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
 from lipcore.kernels.base import Params
 from lipcore.kernels.geometry import Geometry
-from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.parameters import passing_friction
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.compact import CompactPosterior
@@ -26,7 +25,7 @@ from lipcore.posterior.conformal import Conformal, fit_conformal
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.statistics import collect
 from lipcore.training.conditioning import condition_arm, should_condition
-from lipcore.training.correction import correct, corrected_joints
+from lipcore.training.correction import Correction, correct, corrected_joints
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
 
@@ -35,13 +34,13 @@ def fit_estimator(
     name: str,
     learnt: ArmFit | None = None,
     geometries: Sequence[Geometry] = (),
-    before: ResidualKernel | None = None,
+    correct: Callable[[CompactPosterior, Samples], Correction] = correct,
 ) -> TorqueModel:
     """Train one estimator on the samples of a task.
 
     name: one of `lipcore.estimators.catalogue.ESTIMATORS`; learnt: rigid bodies learnt from these samples before.
     Estimators without rigid bodies read the uncertainty of friction at rest from them; geometries: first starts of a
-    search, base to tip; before: correction by an earlier fit. Raise ValueError like `check_estimator`,
+    search, base to tip; correct: corrects an arm, given the samples. Raise ValueError like `check_estimator`,
     FitCancelledError, or NotPositiveDefiniteError.
     """
     samples, types, options = task.samples, task.joint_types, task.options
@@ -71,7 +70,7 @@ def fit_estimator(
             arm, weights = compression.posterior, thinned_weights(samples.t)
             if should_condition(options, len(samples), float(weights.sum())):
                 arm = condition_arm(arm, samples, weights)  # the correction must not learn what the arm can
-            correction = correct(arm, samples, before)
+            correction = correct(arm, samples)
             report |= correction.report()
             estimator = estimator.corrected(correction.residual)
             posterior = arm.corrected(estimator.kernel, correction.noise, correction.a)

@@ -67,8 +67,8 @@ class LearningCurve:
 def learning_curve(model: TorqueModel, task: Task, held_out: Samples) -> LearningCurve | None:
     """Return the learning curve of a model; None if the training has too few effective samples or no varying torque.
 
-    task: with the samples that the model has learnt. Each part of them is learnt by `relearn`: geometry and
-    hyperparameters stay those of all samples. held_out: in order. Raise like `relearn`.
+    task: with the samples that the model has learnt. Each part of them is learnt by `relearn`: geometry,
+    hyperparameters and centres stay those of all samples. held_out: in order. Raise like `relearn`.
     """
     samples = task.samples
     order = np.lexsort((samples.t, samples.episode))

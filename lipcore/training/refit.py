@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from lipcore.arm.learning import ArmFit, learn
 from lipcore.data.independence import motion_dimensions
@@ -15,7 +16,8 @@ from lipcore.model.selection import Selection, shortened
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.misfit import shared_rows
 from lipcore.posterior.selection import spread_out
-from lipcore.training.correction import corrected_joints
+from lipcore.training import correction
+from lipcore.training.correction import correct, corrected_joints
 from lipcore.training.fit import compact, fit_estimator
 from lipcore.vocabulary import LOCAL, RIGID
 
@@ -54,7 +56,7 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
         learnt = learn(task, begin=model.arm.geometries)
         searched = {key: value for key, value in model.fit.items() if key.startswith("search_")}
         learnt = replace(learnt, report={**learnt.report, **searched})
-        again = fit_estimator(task, name, learnt, before=model.posterior.basis.residual)
+        again = fit_estimator(task, name, learnt, correct=partial(correct, before=model.posterior.basis.residual))
         again = replace(again, selection=model.selection)
         if name == RIGID and model.selection is not None:
             again = _choose_corrected(again, model.selection, fit_estimator(task, LOCAL, learnt))
@@ -69,7 +71,8 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
 def relearn(model: TorqueModel, task: Task) -> TorqueModel:
     """Return the model with weights learnt from the samples of a task; geometry, drive and hyperparameters stay.
 
-    It takes less time than `refit`. Raise like `refit`.
+    The centres of a correction stay, too, and its errors are not estimated. It takes less time than `refit`. Raise like
+    `refit`.
     """
     name, before, samples = model.estimator.name, model.posterior, task.samples
     if name not in (RIGID, LOCAL):
@@ -80,7 +83,10 @@ def relearn(model: TorqueModel, task: Task) -> TorqueModel:
     variance = before.misfit.of_row(before.noise_variance, samples.rows(rows).motion(), shared)
     report = {"objective": model.fit["objective"]}
     learnt = ArmFit(model.arm, dict(before.params), rows, before.noise_variance / variance, before.misfit, report)
-    return fit_estimator(task, name, learnt, before=before.basis.residual)
+    if (residual := before.basis.residual) is None:
+        return fit_estimator(task, name, learnt)
+    again = partial(correction.relearn, before=residual, noise=before.noise_variance)
+    return fit_estimator(task, name, learnt, correct=again)
 
 
 def _choose_corrected(arm: TorqueModel, before: Selection, local: TorqueModel) -> TorqueModel:

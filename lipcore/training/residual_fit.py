@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,83 +19,24 @@ from lipcore.posterior.linalg import (
     mirror,
     solve_lower,
     solve_lower_right,
-    whiten_rows,
 )
-from lipcore.posterior.selection import pivots
+from lipcore.training.centres import CHUNK, Blocks, Centres
 from lipcore.training.lengthscales import Shape
-
-Blocks = Sequence[tuple[slice, SplitRows]]
-"""Contiguous blocks of N samples, which they cover, each with the rows to train on and to test."""
-CHUNK = 2048
-"""Samples of one matrix product."""
 
 
 @dataclass(frozen=True)
 class ResidualOptions:
-    """Numbers of centres, and the gain that a correction needs."""
+    """Gains that a correction and more centres need."""
 
     min_gain: float = 0.2
     """Min gain of a corrected joint, as a share of its squared error."""
     min_gain_errors: float = 2.82
     """The same in standard errors: the 99 % point of t for ten blocks."""
-    sizes: tuple[int, ...] = (25, 50, 100, 200, 400, 800, 1500)
-    """Numbers of centres that are tried, the fewest first."""
     min_progress: float = 0.02
-    """Min gain of the squared error from more centres than `fast`."""
-    features: int = 100
-    """Max number of centres that standard deviations and streams use, because their cost grows with its square."""
-    fast: int = 200
-    """Max number of centres of fast answers, because the cost of a mean grows with it."""
-    open_share: float = 1e-4
-    """Max share of the correction's variance that the centres do not explain at the samples."""
+    """Min gain of the squared error from more centres than those of fast answers."""
 
 
 OPTIONS = ResidualOptions()
-
-
-@dataclass(frozen=True)
-class Centres:
-    """Centres of one joint's residual, chosen among N samples."""
-
-    scaled: Array
-    """Inputs of the samples in lengthscales, (N, 4 n), of float32 numbers."""
-    rows: Indices
-    """Rows of the centres, (m,), in the order of choice."""
-    root: Array
-    """Cholesky factor of their correlations, (m, m)."""
-
-    @classmethod
-    def choose(cls, inputs: Array, lengthscales: Array, candidates: Indices) -> Centres:
-        """Return centres. inputs: (N, 4 n); lengthscales: (4 n,); candidates: rows to choose from."""
-        scaled = (inputs / lengthscales).astype(np.float32).astype(np.float64)
-        some = scaled[candidates]
-        order = pivots(_correlations(some, some), 1, OPTIONS.sizes[-1], OPTIONS.open_share)
-        return cls(scaled, candidates[order.outputs], np.ascontiguousarray(order.lower[order.outputs]))
-
-    def sizes(self) -> list[int]:
-        """Return the numbers of centres to try."""
-        count = len(self.rows)
-        return [*(size for size in OPTIONS.sizes if size < count), count]
-
-    def features(self, blocks: Blocks) -> tuple[NDArray[np.float32], Array]:
-        """Return the whitened correlations φ of the N samples with the centres, (N, m), and their nearness, (N, sizes).
-
-        The nearness is the largest squared correlation with one of the first centres that is not held out with the
-        sample, for each number of `sizes`.
-        """
-        sizes = self.sizes()
-        features = np.empty((len(self.scaled), len(self.rows)), np.float32)
-        nearness = np.empty((len(self.scaled), len(sizes)))
-        for block, parts in blocks:
-            others = parts.train[self.rows]
-            for first in range(block.start, block.stop, CHUNK):
-                rows = slice(first, min(first + CHUNK, block.stop))
-                near = _correlations(self.scaled[rows], self.scaled[self.rows])
-                most = [(near * others)[:, a:b].max(axis=1) for a, b in pairwise([0, *sizes])]
-                nearness[rows] = np.maximum.accumulate(np.square(most), axis=0).T
-                whiten_rows(self.root, near)
-                features[rows] = near
-        return features, nearness
 
 
 @dataclass(frozen=True)
@@ -162,6 +101,12 @@ class BlockSums:
             variance[block] += np.square(_factor(self.a - a).whiten(features)).sum(axis=0)
         return variance
 
+    def symmetric(self) -> Array:
+        """Return A with both triangles."""
+        a = self.a.copy()
+        mirror(a)
+        return a
+
     def variables(self) -> Array:
         """Return the mean of u from all samples, (m,)."""
         return _factor(self.a).solve(self.b)
@@ -176,14 +121,25 @@ def _factor(a: Array) -> Factor:
 
 @dataclass(frozen=True)
 class MeanFit:
-    """The mean of a joint's residual from some number of centres."""
+    """The mean of a joint's residual from the first of its centres."""
 
     variables: Array
     """Mean of their whitened variables, (size,)."""
-    error: float
-    """Squared error with it, divided by that without."""
-    taken: float
-    """Share of what `few` features leave that the centres explain, see `JointResidual`."""
+    held_out: Array
+    """Mean at all samples, each block from the others, (N,) N·m."""
+    errors: Array
+    """Squared error of each held-out block, (B,) (N·m)²."""
+
+    @classmethod
+    def of(cls, sums: BlockSums, values: Array, blocks: Blocks) -> MeanFit:
+        """Return the mean from the sums of N samples. values: (N,) N·m."""
+        mean = sums.predict_mean(blocks)
+        return cls(sums.variables(), mean, block_errors(values - mean, blocks))
+
+
+def block_errors(residual: Array, blocks: Blocks) -> Array:
+    """Return the mean square of a residual over each held-out block, (B,). residual: (N,)."""
+    return np.array([np.mean(np.square(residual)[parts.held_out]) for _, parts in blocks])
 
 
 @dataclass(frozen=True)
@@ -191,7 +147,6 @@ class JointFit:
     """A joint's residual from N samples, and the errors of their blocks."""
 
     centres: Centres
-    shape: Shape
     rich: MeanFit
     """From the chosen number of centres."""
     fast: MeanFit
@@ -200,12 +155,18 @@ class JointFit:
     """A of the features, at most `features` of them, with `variance` and `noise`, (k, k)."""
     held_out: Array
     """Mean and variance at all samples, each block from the others, (2, N)."""
-    gains: bool
-    """Whether `rich` reduces the error beyond chance."""
+    without: Array
+    """Squared error of each held-out block without the residual, (B,) (N·m)²."""
+    mean_variance: float
+    """Variance without data of the means' fit, (N·m)²."""
     variance: float
     """Variance without data, (N·m)²."""
     noise: float
     """Variance of the noise, (N·m)²."""
+    taken: float
+    """Share of what the features leave that all centres of `rich` explain, see `JointResidual`."""
+    fast_taken: float
+    """The same of `fast`."""
 
     @classmethod
     def of(
@@ -224,84 +185,102 @@ class JointFit:
         candidates: rows to choose centres from. Both variances are scaled to the errors; far from the samples, the
         torque is as uncertain as the arm's.
         """
-        centres = Centres.choose(inputs, shape.lengthscales, candidates)
-        features, nearness = centres.features(blocks)
+        centres, chosen = Centres.choose(inputs[candidates], shape.lengthscales)
+        features, nearness = centres.features(inputs, candidates[chosen], blocks)
         white, sizes = shape.noise / weights, centres.sizes()
-
-        def errors(predicted: Array | float) -> Array:
-            return np.array([np.mean(np.square(values - predicted)[parts.held_out]) for _, parts in blocks])
 
         def sums_of(place: int) -> BlockSums:
             return BlockSums.of(features[:, : sizes[place]], shape.variance, white, values, blocks)
 
-        rich = fast = few = 0
-        sums = fast_sums = sums_of(0)
-        predicted = quickly = sums.predict_mean(blocks)
-        for place in range(1, len(sizes)):
-            larger = sums_of(place)
-            mean = larger.predict_mean(blocks)
-            slow = sizes[place] > OPTIONS.fast
-            if slow and errors(mean).mean() > (1 - OPTIONS.min_progress) * errors(predicted).mean():
+        rich = fast = min(1, len(sizes) - 1)
+        best = quick = MeanFit.of(sums_of(fast), values, blocks)
+        for place in range(fast + 1, len(sizes)):
+            larger = MeanFit.of(sums_of(place), values, blocks)
+            if larger.errors.mean() > (1 - OPTIONS.min_progress) * best.errors.mean():
                 break
-            rich, sums, predicted = place, larger, mean
-            if not slow:
-                fast, fast_sums, quickly = place, larger, mean
-            if sizes[place] <= OPTIONS.features:
-                few = place
-        without = errors(0.0)
-        gain = without - errors(predicted)
-        chance = OPTIONS.min_gain_errors * gain.std(ddof=1) / np.sqrt(len(gain))
-        tested, squares = np.any([parts.held_out for _, parts in blocks], axis=0), np.square(values - predicted)
-        first = sums_of(few)
-        variances, open_ = first.predict_variance(blocks), first.beyond * nearness[:, rich]
-        variances -= _taken(variances + shape.noise - squares, open_, tested) * open_
-        stretch = max(0.01, float(np.mean((squares / (variances + shape.noise))[tested])))
+            rich, best = place, larger
+        tested = np.any([parts.held_out for _, parts in blocks], axis=0)
+
+        def taken(variances: Array, beyond: Array, mean: MeanFit, place: int) -> float:
+            return _taken(variances - np.square(values - mean.held_out), beyond * nearness[:, place], tested)
+
+        first = sums_of(0)
+        variances = first.predict_variance(blocks)
+        variances -= taken(variances + shape.noise, first.beyond, best, rich) * first.beyond * nearness[:, rich]
+        expected = variances + shape.noise
+        stretch = max(0.01, float(np.mean((np.square(values - best.held_out) / expected)[tested])))
         own = stretch * shape.noise
         variance = max(stretch * shape.variance, noise - own)
         scaled = BlockSums.of(first.features, variance, own / weights, values, blocks)
         variances = scaled.predict_variance(blocks)
+        shares = [taken(variances + own, scaled.beyond, *each) for each in ((best, rich), (quick, fast))]
+        return cls(
+            centres,
+            best,
+            quick,
+            scaled.symmetric(),
+            np.stack([best.held_out, variances - shares[0] * scaled.beyond * nearness[:, rich]]),
+            block_errors(values, blocks),
+            shape.variance,
+            variance,
+            own,
+            *shares,
+        )
 
-        def fitted(place: int, sums: BlockSums, mean: Array) -> MeanFit:
-            error = float(errors(mean).mean() / without.mean()) if without.any() else 1.0
-            taken = _taken(variances + own - np.square(values - mean), scaled.beyond * nearness[:, place], tested)
-            return MeanFit(sums.variables(), error, taken)
+    @property
+    def gains(self) -> bool:
+        """Whether `rich` reduces the error beyond chance."""
+        gain = self.without - self.rich.errors
+        chance = OPTIONS.min_gain_errors * gain.std(ddof=1) / np.sqrt(len(gain))
+        return bool(gain.mean() > max(OPTIONS.min_gain * self.without.mean(), chance))
 
-        best, quick = fitted(rich, sums, predicted), fitted(fast, fast_sums, quickly)
-        gains = bool(gain.mean() > max(OPTIONS.min_gain * without.mean(), chance))
-        held_out = np.stack([predicted, variances - best.taken * scaled.beyond * nearness[:, rich]])
-        a = scaled.a
-        mirror(a)
-        return cls(centres, shape, best, quick, a, held_out, gains, variance, own)
+    def share(self, mean: MeanFit) -> float:
+        """Return the squared error with a mean, divided by that without."""
+        return float(mean.errors.mean() / self.without.mean()) if self.without.any() else 1.0
 
     def residual(self) -> JointResidual:
         """Return the residual."""
-        count, few = len(self.rich.variables), len(self.a)
-        root = self.centres.root
+        few = len(self.a)
         weights, fast_weights = (
-            np.sqrt(self.shape.variance)
-            * solve_lower(_first(root, len(each.variables)), each.variables, transposed=True)
-            for each in (self.rich, self.fast)
+            _weights(self.centres.root, self.mean_variance, each.variables) for each in (self.rich, self.fast)
         )
         return JointResidual(
-            self.shape.lengthscales,
-            self.centres.scaled[self.centres.rows[:count]],
+            self.centres.lengthscales,
+            self.centres.places[: len(weights)],
             weights,
-            np.sqrt(self.variance) * solve_lower_right(np.eye(few), _first(root, few)),
+            np.sqrt(self.variance) * solve_lower_right(np.eye(few), _first(self.centres.root, few)),
             self.variance,
-            self.rich.taken,
+            self.taken,
             fast_weights,
-            self.fast.taken,
+            self.fast_taken,
         )
+
+
+def learn_weights(
+    joint: JointResidual, inputs: Array, values: Array, weights: Array, noise: float
+) -> tuple[JointResidual, Array]:
+    """Return a residual with weights learnt from other samples, and A of its features, (k, k).
+
+    Centres and variances stay. Arguments: see `JointFit.of`; noise: beside the residual, (N·m)².
+    """
+    centres, every = Centres.of(joint), slice(0, len(inputs))
+    features = np.concatenate([centres.whiten(near) for _, near in centres.near(inputs, every)])
+    blocks = [(every, SplitRows(np.ones(len(inputs), bool), np.zeros(len(inputs), bool)))]
+    few, fast, rich = (
+        BlockSums.of(features[:, :size], joint.variance, noise / weights, values, blocks)
+        for size in (len(joint.root), len(joint.fast_weights), len(joint.weights))
+    )
+    found, fast_found = (_weights(centres.root, joint.variance, each.variables()) for each in (rich, fast))
+    return replace(joint, weights=found, fast_weights=fast_found), few.symmetric()
+
+
+def _weights(root: Array, variance: float, variables: Array) -> Array:
+    """Return the weights of correlations, (m,) N·m. variables: mean of the whitened variables, (m,)."""
+    return float(np.sqrt(variance)) * solve_lower(_first(root, len(variables)), variables, transposed=True)
 
 
 def _first(root: Array, size: int) -> Array:
     return np.ascontiguousarray(root[:size, :size])
-
-
-def _correlations(a: Array, b: Array) -> Array:
-    """Return exp(−½ |a − b|²), (K, m). a: (K, D); b: (m, D)."""
-    squares = np.einsum("kd,kd->k", a, a)[:, None] - 2 * (a @ b.T) + np.einsum("md,md->m", b, b)
-    return np.asarray(np.exp(-0.5 * np.maximum(squares, 0.0)))
 
 
 def _taken(excess: Array, open_: Array, tested: NDArray[np.bool_]) -> float:

@@ -84,7 +84,7 @@ class PlannedFit:
         except (ArithmeticError, ValueError):
             logger.exception("the learning curve failed; the version has none")
             return None
-        return None if curve is None else {**asdict(curve), "text": curve.text}
+        return None if curve is None else asdict(curve)
 
     def _task(self, on_progress: Progress | None, heartbeat: Heartbeat) -> Task:
         data = self.data

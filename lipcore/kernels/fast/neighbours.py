@@ -31,8 +31,8 @@ def likelihood_given_neighbours(
     (½ / v − ½ e² / v²) (dv) + (e / v) (de) with dv = d(s² + r) − 2 aᵀ dk + aᵀ dC a and de = −bᵀ dk + aᵀ dC b.
     """
     size, most = inputs.shape[1], neighbours.shape[1]
-    rates, scale, noise = np.exp(-2 * logs[:size]), math.exp(logs[size]), math.exp(logs[size + 1])
-    squares = np.empty((most + 1, most + 1, size))
+    rates, scale, noise = np.exp(-logs[:size]), math.exp(logs[size]), math.exp(logs[size + 1])
+    scaled = np.empty((most + 1, size))
     root, gram = np.empty((most, most)), np.empty((most + 1, most + 1))
     a, b = np.empty(most), np.empty(most)
     gradient[:] = 0.0
@@ -41,7 +41,7 @@ def likelihood_given_neighbours(
         here, count = rows[row], 0
         while count < most and neighbours[row, count] >= 0:
             count += 1
-        _compare(inputs, here, neighbours[row, :count], rates, scale, squares, gram)
+        _compare(inputs, here, neighbours[row, :count], rates, scale, scaled, gram)
         for p in range(count):  # Cholesky factor of C, and both solutions forwards
             for q in range(p):
                 left = gram[p, q]
@@ -80,29 +80,27 @@ def likelihood_given_neighbours(
             change = -(2 * by_variance * a[p] + by_error * b[p]) * gram[count, p]
             by_scale += change
             for d in range(size):
-                gradient[d] += change * squares[count, p, d]
+                gradient[d] += change * (scaled[count, d] - scaled[p, d]) ** 2
             for q in range(p):
                 change = (2 * by_variance * a[p] * a[q] + by_error * (a[p] * b[q] + b[p] * a[q])) * gram[p, q]
                 by_scale += change
                 for d in range(size):
-                    gradient[d] += change * squares[p, q, d]
+                    gradient[d] += change * (scaled[p, d] - scaled[q, d]) ** 2
         gradient[size] += by_scale
         gradient[size + 1] += by_noise
     return total
 
 
 @inlined
-def _compare(
-    inputs: Array, here: int, others: Indices, rates: Array, scale: float, squares: Array, gram: Array
-) -> None:
-    """Write (x_d − x'_d)² / ℓ_d² and the covariances of all pairs of the others and, last, of `here` with them."""
+def _compare(inputs: Array, here: int, others: Indices, rates: Array, scale: float, scaled: Array, gram: Array) -> None:
+    """Write x_d / ℓ_d and the covariances of all pairs of the others and, last, of `here` with them."""
     count, size = others.shape[0], inputs.shape[1]
     for p in range(count + 1):
         one = here if p == count else others[p]
+        for d in range(size):
+            scaled[p, d] = inputs[one, d] * rates[d]
         for q in range(p):
             distance = 0.0
             for d in range(size):
-                square = (inputs[one, d] - inputs[others[q], d]) ** 2 * rates[d]
-                squares[p, q, d] = square
-                distance += square
+                distance += (scaled[p, d] - scaled[q, d]) ** 2
             gram[p, q] = scale * np.exp(-0.5 * distance)

@@ -33,6 +33,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.transfer import consolidate
 from lipcore.posterior.compression import build_linear
 from lipcore.posterior.misfit import Misfit
+from lipcore.training.correction import correct
 from lipcore.training.fit import fit_estimator
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 from tests import ROOT
@@ -159,7 +160,8 @@ def train_with_correction(kinds: str, seed: int) -> TorqueModel:
     samples = replace(samples, tau=samples.tau + 0.1 * np.sin(9 * samples.q))
     task = Task(samples, robot.joint_types, OPTIONS)
     before = correction_before(samples, (0, 1))
-    model = fit_estimator(task, "rigid-body+local", learn(task, begin=(geometry.canonical(),)), before=before)
+    learnt = learn(task, begin=(geometry.canonical(),))
+    model = fit_estimator(task, "rigid-body+local", learnt, correct=partial(correct, before=before))
     parts = (samples.t, samples.q, samples.dq, samples.ddq, samples.tau + 0.05 * np.cos(9 * samples.q))
     return consolidate(OnlineModel.start(model).learn(Rows(*parts, np.zeros(len(samples), np.uint8))))
 

@@ -25,6 +25,7 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.misfit import shared_rows
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Simulation, simulate
+from lipcore.training.correction import correct
 from lipcore.training.fit import fit_estimator
 from lipcore.vocabulary import LOCAL, Code
 from tests.choosing import few
@@ -58,7 +59,7 @@ def model(request: pytest.FixtureRequest) -> TorqueModel:
 def train_correction(samples: Samples) -> TorqueModel:
     """Train an arm with a correction of both joints, whether or not they need one."""
     task = Task(samples, TYPES, OPTIONS)
-    model = fit_estimator(task, LOCAL, learn(task), before=correction_before(samples, (0, 1)))
+    model = fit_estimator(task, LOCAL, learn(task), correct=partial(correct, before=correction_before(samples, (0, 1))))
     assert (model.posterior.basis.residual.sizes > 0).all()
     return model
 

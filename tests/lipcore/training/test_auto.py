@@ -218,7 +218,7 @@ def test_failed_estimator_is_reported_and_others_continue(monkeypatch):
     assert local["error"] is not None
     assert chain["error"] is None
 
-    monkeypatch.setattr(auto, "fit_estimator", lambda *given: (_ for _ in ()).throw(ValueError("neither")))
+    monkeypatch.setattr(auto, "fit_estimator", lambda *given, **named: (_ for _ in ()).throw(ValueError("neither")))
     with pytest.raises(NotPositiveDefiniteError, match="nothing can be"):
         train(simulate_arm(), TYPES, options=OPTIONS)
 
