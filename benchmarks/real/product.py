@@ -30,12 +30,16 @@ BATCH_ROWS = 500
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained version, the estimator it chose, and the duration of its job, s."""
+    """A trained version."""
 
     model: str
     version: int
     estimator: str
+    """The chosen estimator."""
     seconds: float
+    """Duration of the job."""
+    peak_mb: int
+    """Peak memory of the job's process."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +58,16 @@ class Bed:
         finally:
             storage.database.close()
 
-    def train(self, model: str, samples: Samples, joint_types: Sequence[str], robot: str | None) -> Trained:
-        """Upload samples and train on them with default options; raise BenchError if the job fails."""
+    def upload(self, name: str, samples: Samples) -> str:
+        """Upload samples; return the id of the data set."""
         with TemporaryDirectory() as folder:
-            path = Path(folder) / f"{model}.npz"
+            path = Path(folder) / f"{name}.npz"
             write_recording(path, samples)
-            dataset = self.client.upload(path)
-        queued = self.client.train(model, [dataset.id], joint_types=joint_types, robot=robot)
+            return self.client.upload(path, units={"t": "s"}).id
+
+    def train(self, model: str, datasets: Sequence[str], joint_types: Sequence[str], robot: str | None) -> Trained:
+        """Train on data sets with default options; raise BenchError if the job fails."""
+        queued = self.client.train(model, datasets, joint_types=joint_types, robot=robot)
         job = self.client.wait(queued.id)
         if job.state != SUCCEEDED or job.version is None or job.started_at is None or job.finished_at is None:
             raise BenchError(
@@ -68,7 +75,8 @@ class Bed:
             )
         spent = datetime.fromisoformat(job.finished_at) - datetime.fromisoformat(job.started_at)
         version = self.client.version(model, job.version)
-        return Trained(model, job.version, version.estimator, spent.total_seconds())
+        peak_mb = version.lineage["training_process"]["peak_memory_mb"]
+        return Trained(model, job.version, version.estimator, spent.total_seconds(), peak_mb)
 
     def predict(self, trained: Trained, samples: Samples) -> Forecast:
         """Predict the torque along the motion, and the standard deviation equivalent to the 95 % interval."""

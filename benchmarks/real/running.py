@@ -125,7 +125,8 @@ def compute_cell(cell: Cell, recording: Recording, split: Split, service: Servic
     if cell.method == PRODUCT:
         bed, types = service(), recording.joint_types(split.train.n_joints)
         robot = recording.robot if cell.knowledge == "URDF" else None
-        trained = bed.train(f"{cell.recording}-{cell.split}-{cell.knowledge}".lower(), split.train, types, robot)
+        name = f"{cell.recording}-{cell.split}-{cell.knowledge}".lower()
+        trained = bed.train(name, [bed.upload(name, split.train)], types, robot)
         return evaluate_forecast(cell, split, bed.predict(trained, states), trained.seconds, trained.estimator)
     known = cell.knowledge == "URDF"
     if cell.method == BASE_FRICTION:
