@@ -14,7 +14,7 @@ from lipcore.posterior.basis import Basis
 from lipcore.posterior.exact import Posterior, Prediction
 from lipcore.posterior.linalg import block_diagonal, solve_lower, solve_lower_right
 from lipcore.posterior.misfit import Misfit
-from lipcore.posterior.statistics import Solution, Statistics, learnt_root, solve
+from lipcore.posterior.statistics import Solution, Statistics, learnt_root, rounding_of, solve
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class CompactPosterior(Posterior):
     @cached_property
     def learnt(self) -> Array:
         """Root of the variance that samples explain, (M, M) lower triangular; its square is B⁻ᵀ (I − Σ) B⁻¹."""
-        return solve_lower_right(learnt_root(self.covariance), self.basis.root)
+        return solve_lower_right(learnt_root(self.covariance, rounding_of(self.statistics)), self.basis.root)
 
     def whiten(self, cross: Array) -> Array:
         """Return columns with the explained variance as their square, (M, K).

@@ -150,14 +150,19 @@ def make_solution(mean: Array, covariance: Array, first: int = 0) -> Solution:
     return Solution(mean, _stacked(given.T @ given, left[first:]), first)
 
 
-def learnt_root(covariance: Array) -> Array:
+def learnt_root(covariance: Array, rounding: float = 0.0) -> Array:
     """Return Q, (M, M) lower triangular, with QᵀQ = I − Σ: the variance learnt about whitened variables.
 
-    Raise NotPositiveDefiniteError if Σ exceeds the prior's I.
+    rounding: error of Σ's eigenvalues, see `rounding_of`. Raise NotPositiveDefiniteError if Σ exceeds the prior's I.
     """
     explained = -covariance
     add_diagonal(explained, 1.0)
-    return _lower_root(explained)
+    return _lower_root(explained, rounding)
+
+
+def rounding_of(statistics: Statistics | None) -> float:
+    """Return the rounding error of A's eigenvalues: large for very many samples, or for very exact ones."""
+    return 0.0 if statistics is None else float(np.finfo(np.float64).eps * np.trace(statistics.a))
 
 
 def _stacked(given: Array, left: Array) -> Array:
@@ -170,19 +175,19 @@ def _stacked(given: Array, left: Array) -> Array:
     return out
 
 
-def _lower_root(matrix: Array) -> Array:
+def _lower_root(matrix: Array, rounding: float = 0.0) -> Array:
     """Return Q, lower triangular, with QᵀQ a symmetric matrix. Raise NotPositiveDefiniteError if there is none."""
     some = matrix.diagonal() != 0
     if not some.all():  # the rows of the other variables are zero
         out = np.zeros_like(matrix)
-        out[np.ix_(some, some)] = _lower_root(matrix[np.ix_(some, some)])
+        out[np.ix_(some, some)] = _lower_root(matrix[np.ix_(some, some)], rounding)
         return out
     # with the variables in reverse order it is L Lᵀ: the required factor is Lᵀ, reversed
     root = lower_root(matrix[::-1, ::-1])
     if root is not None:
         return np.ascontiguousarray(root.T[::-1, ::-1])
     values, vectors = eigen(matrix)
-    if not float(values[0]) >= -EIGENVALUE_TOLERANCE:
+    if not float(values[0]) >= -(EIGENVALUE_TOLERANCE + rounding):
         raise NotPositiveDefiniteError(f"a covariance is {-float(values[0]):.3g} above the prior's or below zero")
     root = np.sqrt(values.clip(0.0))[:, None] * vectors.T
     return np.ascontiguousarray(_upper(root[:, ::-1])[::-1, ::-1])

@@ -23,6 +23,7 @@ from lipcore.posterior.statistics import (
     learnt_root,
     make_solution,
     merge,
+    rounding_of,
     solve,
 )
 from lipcore.posterior.summing import Summing, Total
@@ -255,3 +256,11 @@ def test_samples_beyond_the_chosen_ones_are_learnt(samples):
 def test_conditioning_can_be_cancelled(samples):
     with pytest.raises(FitCancelledError):
         condition(train_quickly(samples), samples, cancelled=lambda: True)
+
+
+def test_exact_samples_explain_variance_to_rounding():
+    above = np.diag([1e-12, 1.0, 1 + 2e-5])  # less than the rounding of 1e12 above the prior
+    with pytest.raises(NotPositiveDefiniteError, match="above the prior's"):
+        learnt_root(above)
+    root = learnt_root(above, rounding_of(Statistics(np.diag([1e12, 0.0, 0.0]), np.zeros(3), 40.0)))
+    np.testing.assert_allclose(root.T @ root, np.diag([1.0, 0.0, 0.0]), atol=1e-9)
