@@ -97,8 +97,10 @@ class Summing:
             whiten_rows(basis.root[:first, :first], chosen)
             out[:, :first] = chosen
         for each in basis.linear:
-            columns = basis.rows(each)
-            np.multiply(each.flat_features(motion), basis.scales[columns], out=out[:, columns])
+            rows = each.flat_features(motion)
+            columns = slice(first, first + rows.shape[1])
+            np.multiply(rows, basis.scales[columns], out=out[:, columns])
+            first = columns.stop
 
     def _elsewhere(self, total: Total, samples: Samples, weights: Array) -> Array:
         motion = samples.motion()

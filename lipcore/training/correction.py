@@ -121,7 +121,7 @@ def correct(
     return Correction(ResidualKernel(found), noise, block_diagonal(sums), errors, fast_errors, conformal)
 
 
-def relearn(arm: CompactPosterior, samples: Samples, before: ResidualKernel, noise: Array) -> Correction:
+def relearn_correction(arm: CompactPosterior, samples: Samples, before: ResidualKernel, noise: Array) -> Correction:
     """Return a correction by an earlier fit with weights learnt from samples; its centres and variances stay.
 
     noise: variance of the noise beside it, (n,) (N·m)². Errors are not estimated.

@@ -16,8 +16,7 @@ from lipcore.model.selection import Selection, shortened
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.misfit import shared_rows
 from lipcore.posterior.selection import spread_out
-from lipcore.training import correction
-from lipcore.training.correction import correct, corrected_joints
+from lipcore.training.correction import correct, corrected_joints, relearn_correction
 from lipcore.training.fit import compact, fit_estimator
 from lipcore.vocabulary import LOCAL, RIGID
 
@@ -85,7 +84,7 @@ def relearn(model: TorqueModel, task: Task) -> TorqueModel:
     learnt = ArmFit(model.arm, dict(before.params), rows, before.noise_variance / variance, before.misfit, report)
     if (residual := before.basis.residual) is None:
         return fit_estimator(task, name, learnt)
-    again = partial(correction.relearn, before=residual, noise=before.noise_variance)
+    again = partial(relearn_correction, before=residual, noise=before.noise_variance)
     return fit_estimator(task, name, learnt, correct=again)
 
 
