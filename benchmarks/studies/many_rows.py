@@ -1,6 +1,7 @@
 """Error, coverage, time and memory of default trainings with few and with many rows, through the service.
 
-    many_rows.py panda ROWS...               a simulated Panda with `Dirt`; the test is other motion of the same kind
+    many_rows.py panda ROWS...               the first rows of a recording of a simulated Panda with `Dirt`, at 20 Hz; the
+                                             test is other motion of the same kind
     many_rows.py shards COUNT                the same Panda, COUNT recordings of 44 000 rows each
     many_rows.py sarcos FILE ROWS [SEED...]  random splits of SARCOS' test file, compared with kernel ridge regression
 
@@ -120,8 +121,7 @@ def main() -> None:
             return
         every = panda(100)
         for count in arguments:
-            rows = np.linspace(0, len(every) - 1, int(count)).round().astype(np.int64)
-            print(train(bed, f"rows-{count}", [every.rows(rows)], test, types), flush=True)
+            print(train(bed, f"rows-{count}", [every.rows(slice(int(count)))], test, types), flush=True)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from lipcore.data.motion import Indices
 from lipcore.data.samples import Array
 from lipcore.data.splits import SplitRows
 from lipcore.kernels.residual import JointResidual
-from lipcore.posterior.linalg import cholesky, whiten_rows
+from lipcore.posterior.linalg import add_diagonal, cholesky, whiten_rows
 from lipcore.posterior.selection import pivots
 
 Blocks = Sequence[tuple[slice, SplitRows]]
@@ -51,10 +51,21 @@ class Centres:
     """Cholesky factor of their correlations, (m, m)."""
 
     @classmethod
-    def choose(cls, candidates: Array, lengthscales: Array) -> tuple[Centres, Indices]:
-        """Return centres, and their rows among K candidates. candidates: inputs, (K, 4 n); lengthscales: (4 n,)."""
+    def choose(
+        cls, candidates: Array, lengthscales: Array, values: Array, noise: Array, blocks: Blocks
+    ) -> tuple[Centres, Indices]:
+        """Return centres, and their rows among K candidates.
+
+        Centres of fast answers are where the residual is large that the other blocks predict: what is learnt only there
+        must not choose them. The others are where the candidates are.
+
+        candidates: inputs, (K, 4 n); lengthscales: (4 n,); values: residual, (K,), in any unit; noise: its variance
+        over that of the residual, (K,); blocks: of the candidates.
+        """
         some = (candidates / lengthscales).astype(np.float32).astype(np.float64)
-        order = pivots(_correlations(some, some), 1, OPTIONS.rich[-1], OPTIONS.open_share)
+        near = _correlations(some, some)
+        expected = predict_held_out(near, values, noise, blocks)
+        order = pivots(near, 1, OPTIONS.rich[-1], OPTIONS.open_share, expected, OPTIONS.fast)
         rows = order.outputs
         return cls(lengthscales, some[rows], np.ascontiguousarray(order.lower[rows])), rows
 
@@ -95,6 +106,31 @@ class Centres:
                 nearness[part] = np.maximum.accumulate(np.square(most), axis=0).T
                 features[part] = self.whiten(near)
         return features, nearness
+
+
+def predict_held_out(gram: Array, values: Array, noise: Array, blocks: Blocks) -> Array:
+    """Return the mean of a Gaussian process at K samples, (K,), each block from the others.
+
+    With P = (K + R)⁻¹, samples S that are not trained on have the mean y_S − P_SS⁻¹ (P y)_S. gram: K, (K, K); values:
+    y, (K,); noise: diagonal of R, (K,).
+    """
+    noisy, mean, change = gram.copy(), values.copy(), np.zeros(len(values))
+    add_diagonal(noisy, noise)
+    inverse = cholesky(noisy).inverse()
+    weights = inverse @ values
+    for block, parts in blocks:
+        out = np.flatnonzero(~parts.train)
+        change[out] = cholesky(inverse[np.ix_(out, out)]).solve(weights[out])
+        mean[block] -= change[block]
+    return mean
+
+
+def blocks_of(rows: Indices, blocks: Blocks) -> Blocks:
+    """Return the blocks of some rows, sorted, of N samples."""
+    return [
+        (slice(*np.searchsorted(rows, (block.start, block.stop))), SplitRows(parts.train[rows], parts.held_out[rows]))
+        for block, parts in blocks
+    ]
 
 
 def _correlations(a: Array, b: Array) -> Array:

@@ -27,14 +27,15 @@ class LengthscaleOptions:
     a simulated UR10 and Kinova with `Dirt`.
     """
 
-    max_rows: int = 1500
+    max_rows: int = 2400
     """Max number of samples whose likelihood is computed."""
-    neighbours: int = 45
-    """Max number of neighbours of a sample."""
+    min_before: int = 100
+    """Number of samples before the first of them, if there are more than `max_rows`."""
+    neighbours: tuple[int, ...] = (30, 45, 60)
+    """Max number of neighbours of a sample: from each start, and in each search from the likeliest result, with the
+    neighbours by the lengthscales of the one before."""
     first_iterations: int = 10
-    """Max iterations from each start. The likeliest result is improved."""
-    rounds: int = 2
-    """Searches, each with the neighbours by the lengthscales of the one before."""
+    """Max iterations from each start."""
     iterations: int = 40
     """Max iterations of a search."""
     prior_std: float = 1.5
@@ -122,12 +123,12 @@ class _Search:
         size, most = len(self.block), OPTIONS.max_rows
         if size <= most:
             return np.arange(size)
-        return np.unique(np.geomspace(most // 3, size - 1, most).astype(np.int64))
+        return np.unique(np.geomspace(OPTIONS.min_before, size - 1, most).astype(np.int64))
 
-    def neighbours(self, log_lengthscales: Array) -> Indices:
-        """Return the nearest samples before each of `rows`, of other blocks; −1 where there are fewer."""
+    def neighbours(self, log_lengthscales: Array, most: int) -> Indices:
+        """Return the `most` nearest samples before each of `rows`, of other blocks; −1 where there are fewer."""
         scaled, size = self.inputs * np.exp(-log_lengthscales), len(self.block)
-        count = min(OPTIONS.neighbours, max(1, size - 1))
+        count = min(most, max(1, size - 1))
         out = np.empty((len(self.rows), count), np.int64)
         for first in range(0, len(self.rows), 100):
             rows = self.rows[first : first + 100]
@@ -150,8 +151,8 @@ class _Search:
         bounds += [(-12.0, np.log(OPTIONS.max_variance)), (np.log(OPTIONS.min_noise), 3.0)]
         width, slopes = np.array([*[OPTIONS.prior_std] * size, np.inf, np.inf]), np.empty(size + 2)
 
-        def descend(starts: list[Array], iterations: int) -> tuple[float, Array]:
-            neighbours = self.neighbours(starts[0][:size])
+        def descend(starts: list[Array], most: int, iterations: int) -> tuple[float, Array]:
+            neighbours = self.neighbours(starts[0][:size], most)
 
             def objective(logs: Array) -> tuple[float, Array]:
                 arrays = self.inputs, values, self.weights, rows, neighbours, logs, slopes
@@ -163,18 +164,17 @@ class _Search:
             found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
             return float(found.fun), np.asarray(found.x)
 
+        first, *others = OPTIONS.neighbours
+        effort = (first, OPTIONS.first_iterations) if len(starts) > 1 else (others[-1], OPTIONS.iterations)
         ends = [
-            descend(
-                [np.array([*logs, np.log(1 - share), np.log(share)]) for share in OPTIONS.noise_shares],
-                OPTIONS.first_iterations if len(starts) > 1 else OPTIONS.iterations,
-            )
+            descend([np.array([*logs, np.log(1 - share), np.log(share)]) for share in OPTIONS.noise_shares], *effort)
             for logs in starts
         ]
         value, logs = min(ends, key=lambda end: end[0])
         weights, squares = self.weights[rows], np.square(values[rows])
         variance = max(float(weights @ squares) / float(weights.sum()), 1e-12)
         alone = 0.5 * float(weights.sum()) * (1 + np.log(variance))
-        for _ in range(OPTIONS.rounds if len(starts) > 1 else 0):
+        for most in others if len(starts) > 1 else []:
             if alone - value >= OPTIONS.min_gain_nats:
-                value, logs = descend([logs], OPTIONS.iterations)
+                value, logs = descend([logs], most, OPTIONS.iterations)
         return logs, alone - value

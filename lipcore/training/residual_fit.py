@@ -20,7 +20,7 @@ from lipcore.posterior.linalg import (
     solve_lower,
     solve_lower_right,
 )
-from lipcore.training.centres import CHUNK, Blocks, Centres
+from lipcore.training.centres import CHUNK, Blocks, Centres, blocks_of
 from lipcore.training.lengthscales import Shape
 
 
@@ -32,8 +32,8 @@ class ResidualOptions:
     """Min gain of a corrected joint, as a share of its squared error."""
     min_gain_errors: float = 2.82
     """The same in standard errors: the 99 % point of t for ten blocks."""
-    min_progress: float = 0.02
-    """Min gain of the squared error from more centres than those of fast answers."""
+    max_progress: float = 0.02
+    """Max gain of the squared error from more centres than the chosen number."""
 
 
 OPTIONS = ResidualOptions()
@@ -185,20 +185,21 @@ class JointFit:
         candidates: rows to choose centres from. Both variances are scaled to the errors; far from the samples, the
         torque is as uncertain as the arm's.
         """
-        centres, chosen = Centres.choose(inputs[candidates], shape.lengthscales)
-        features, nearness = centres.features(inputs, candidates[chosen], blocks)
-        white, sizes = shape.noise / weights, centres.sizes()
+        white, some = shape.noise / weights, candidates
+        centres, chosen = Centres.choose(
+            inputs[some], shape.lengthscales, values[some], white[some] / shape.variance, blocks_of(some, blocks)
+        )
+        features, nearness = centres.features(inputs, some[chosen], blocks)
+        sizes = centres.sizes()
 
         def sums_of(place: int) -> BlockSums:
             return BlockSums.of(features[:, : sizes[place]], shape.variance, white, values, blocks)
 
-        rich = fast = min(1, len(sizes) - 1)
-        best = quick = MeanFit.of(sums_of(fast), values, blocks)
-        for place in range(fast + 1, len(sizes)):
-            larger = MeanFit.of(sums_of(place), values, blocks)
-            if larger.errors.mean() > (1 - OPTIONS.min_progress) * best.errors.mean():
-                break
-            rich, best = place, larger
+        fast = min(1, len(sizes) - 1)
+        means = [MeanFit.of(sums_of(place), values, blocks) for place in range(fast, len(sizes))]
+        errors = [float(each.errors.mean()) for each in means]
+        enough = next(k for k, error in enumerate(errors) if (1 - OPTIONS.max_progress) * error <= min(errors))
+        rich, best, quick = fast + enough, means[enough], means[0]
         tested = np.any([parts.held_out for _, parts in blocks], axis=0)
 
         def taken(variances: Array, beyond: Array, mean: MeanFit, place: int) -> float:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
 
 from lipcore.data.motion import Motion
 from lipcore.posterior.linalg import NotPositiveDefiniteError, cholesky
@@ -54,6 +55,21 @@ def test_outputs_of_selected_samples_come_first() -> None:
     assert order[0] == 3  # the largest of all, in the second sample
     assert order[1] == 2  # its neighbour, although others are larger
     assert sorted(order) == list(range(6))
+
+
+def test_first_outputs_are_where_the_interpolation_of_values_fails_most() -> None:
+    places = np.random.default_rng(2).normal(size=(60, 2))
+    gram = np.exp(-0.5 * cdist(places, places, "sqeuclidean"))
+    values = np.sin(3 * places[:, 0]) * np.exp(-np.square(places[:, 1]))
+    found = pivots(gram, 1, 20, 1e-9, values, 8).outputs
+    for count in range(8):
+        some = found[:count]
+        weights = np.linalg.solve(gram[np.ix_(some, some)], values[some])
+        assert np.abs(values - gram[:, some] @ weights).argmax() == found[count]
+    some = found[:8]
+    explained = gram[:, some] @ np.linalg.solve(gram[np.ix_(some, some)], gram[some])
+    assert (1 - explained.diagonal()).argmax() == found[8]
+    assert pivots(gram, 1, 20, 1e-9, np.zeros(60), 8).outputs.tolist() == pivots(gram, 1, 20, 1e-9).outputs.tolist()
 
 
 def test_factor_solves_whitens_and_has_log_determinant() -> None:

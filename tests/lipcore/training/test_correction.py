@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from lipcore import FitOptions, Samples, TorquePrediction, load, save, train
+from lipcore.data.splits import SplitRows
 from lipcore.estimators.task import Task
 from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
 from lipcore.model.selection import selection
@@ -17,6 +18,7 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
 from lipcore.training import centres, correction, lengthscales, residual_fit
+from lipcore.training.centres import Centres
 from lipcore.training.correction import corrected_joints, held_out_blocks
 from lipcore.training.lengthscales import Shape
 from lipcore.training.refit import refit, relearn, widen_intervals
@@ -136,6 +138,33 @@ def test_sums_of_chunks_are_those_of_all_samples(monkeypatch):
     np.testing.assert_allclose(pieces.a, whole.a, rtol=1e-5, atol=1e-6)  # features in single precision
     np.testing.assert_allclose(pieces.held_out, whole.held_out, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(pieces.residual().weights, whole.residual().weights, rtol=1e-3, atol=1e-3)
+
+
+def test_each_block_is_predicted_from_the_others():
+    samples = simulate_ripple(15.0)
+    some = np.arange(0, len(samples), 3)
+    inputs, values = residual_inputs(samples.motion())[some], samples.tau[some, 0]
+    gram, noise = np.exp(-0.5 * cdist(inputs, inputs, "sqeuclidean")), np.linspace(0.1, 0.3, len(some))
+    blocks = centres.blocks_of(some, held_out_blocks(samples))
+    found = centres.predict_held_out(gram, values, noise, blocks)
+    assert [len(found[block]) for block, _ in blocks] == [10] * 10
+    for block, parts in blocks:
+        train = np.flatnonzero(parts.train)
+        weights = np.linalg.solve(gram[np.ix_(train, train)] + np.diag(noise[train]), values[train])
+        np.testing.assert_allclose(found[block], gram[block][:, train] @ weights, rtol=1e-8, atol=1e-10)
+
+
+def test_fast_centres_are_where_others_predict_the_residual():
+    """The last part of the motion is unlike the others: what is learnt there must not choose centres."""
+    rng = np.random.default_rng(3)
+    places = np.concatenate([rng.uniform(-3, 3, (270, 1)), rng.uniform(20, 22, (30, 1))]) @ np.ones((1, 4)) / 2
+    values = np.where(places[:, 0] < 0, np.sin(4 * places[:, 0]), 0.0) + np.where(places[:, 0] > 5, 9.0, 0.0)
+    rows = np.arange(300)
+    blocks = [(slice(k, k + 30), SplitRows((rows < k) | (rows >= k + 30), rows // 30 == k // 30)) for k in rows[::30]]
+    _, chosen = Centres.choose(places, np.ones(4), values, np.full(300, 0.01), blocks)
+    assert (chosen[:4] < 270).all()
+    assert (places[chosen[:4], 0] < 0.5).all()
+    assert (chosen >= 270).any()
 
 
 def test_correction_learns_more_rows_than_its_centres_are_chosen_from(monkeypatch):
