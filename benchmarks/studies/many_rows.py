@@ -1,12 +1,11 @@
 """Error, coverage, time and memory of default trainings with few and with many rows, through the service.
 
-    many_rows.py panda ROWS...               the first rows of a recording of a simulated Panda with `Dirt`, at 20 Hz; the
-                                             test is other motion of the same kind
-    many_rows.py shards COUNT                the same Panda, COUNT recordings of 44 000 rows each
+    many_rows.py panda ROWS...               the first rows of a recording of a simulated Panda with `Dirt` at 20 Hz
+    many_rows.py shards COUNT                COUNT recordings of 44 000 rows of the same Panda
     many_rows.py sarcos FILE ROWS [SEED...]  random splits of SARCOS' test file, compared with kernel ridge regression
 
-Errors are the squared error over the variance of the test torque. Coverage is that of the 95 % interval. Memory is the
-peak of one process.
+The test of the Panda is other motion of the same kind. Errors are the squared error over the variance of the test
+torque. Coverage is that of the 95 % interval. Memory is the peak of one process.
 """
 
 import sys

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from lipcore.arm.problem import WIDTHS, GeometryPrior, Point, Problem
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array
 from lipcore.kernels.geometry import Geometry, rotation_of, rotation_to_axis
 
@@ -93,7 +94,7 @@ def likely_layouts(
     direction set to it, at known geometries, and at TYPICAL_LAYOUTS. The best of these are improved: each joint in turn
     is tried in all directions, until a pass gains nothing or after `max_sweeps` passes.
     """
-    rows = np.unique(np.linspace(0, len(problem.tau) - 1, OPTIONS.rows).round().astype(np.int64))
+    rows = spaced_rows(len(problem.tau), OPTIONS.rows)
     few = problem.rows(rows)
     few = replace(few, counts=few.counts * (len(problem.tau) / len(rows)))
     search = _Search(few, ends[0].sigma, stop)

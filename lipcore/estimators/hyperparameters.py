@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Motion, spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators import noise
 from lipcore.estimators.options import FitOptions
@@ -140,7 +140,7 @@ def fit(
 
     used = spread_out(motion, options.posterior_samples)
     # evenly chosen among those of the posterior: spread-out samples are not representative
-    even = used[np.linspace(0, len(used) - 1, min(len(used), noise.OPTIONS.samples)).round().astype(np.int64)]
+    even = used[spaced_rows(len(used), noise.OPTIONS.samples)]
     params = search.unpack(result.x)
     params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], floor)
     report = FitReport(

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.adaptive import scores
@@ -183,8 +184,8 @@ def _as_trained(rows: Rows, version: Version, mean: Array, bare: Array) -> BaseP
 
 def choose_compared(weight: Array) -> NDArray[np.int64]:
     """Return the places of the rows to compare. weight: (N,), of all rows."""
-    count = min(len(weight), max(MIN_COMPARED_ROWS, int(np.ceil(COMPARED_PER_SAMPLE * weight.sum()))))
-    return np.linspace(0, len(weight) - 1, count).round().astype(np.int64)
+    count = max(MIN_COMPARED_ROWS, int(np.ceil(COMPARED_PER_SAMPLE * weight.sum())))
+    return spaced_rows(len(weight), count)
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:

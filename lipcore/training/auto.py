@@ -16,6 +16,7 @@ from lipcore.arm.learning import ArmFit, learn
 from lipcore.arm.posing import mode_of
 from lipcore.arm.search import known_geometries
 from lipcore.data.metrics import TorqueDistribution, compare, evaluate
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Samples
 from lipcore.data.signals import noise_level
 from lipcore.data.splits import SplitError, select_rows
@@ -166,7 +167,7 @@ class EstimatorComparison:
             select_rows(work.task.samples, parts.train),
             select_rows(work.task.samples, parts.held_out),
         )
-        rows = np.unique(np.linspace(0, len(held) - 1, 2000).round().astype(np.int64))
+        rows = spaced_rows(len(held), 2000)
         self.held = HeldOutSamples(held.rows(rows), hold.edge[parts.held_out][rows])
         self.entries: dict[str, EstimatorResult] = {}
         self.learnt: ArmFit | None = None

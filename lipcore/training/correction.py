@@ -15,7 +15,7 @@ import numpy as np
 from lipcore.data import metrics
 from lipcore.data.independence import thinned_weights
 from lipcore.data.metrics import LEVEL, quantile
-from lipcore.data.motion import Indices
+from lipcore.data.motion import Indices, spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S, SplitRows, apply_guard
 from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
@@ -147,7 +147,7 @@ def _used_rows(samples: Samples, max_rows: float = np.inf) -> Samples:
 
 def _evenly(size: int, count: float) -> Indices:
     """Return at most `count` of `size` rows, at least two, evenly spaced."""
-    return np.unique(np.linspace(0, size - 1, max(2, round(min(count, size)))).round().astype(np.int64))
+    return spaced_rows(size, max(2, round(min(count, size))))
 
 
 def held_out_blocks(samples: Samples) -> list[tuple[slice, SplitRows]]:

@@ -381,7 +381,9 @@ class LearningCurve(BaseModel):
 
     model_config = ConfigDict(strict=True)
 
-    points: list[CurvePoint] = Field(min_length=1, max_length=100, description="By number of samples; the last has all")
+    points: list[CurvePoint] = Field(
+        max_length=100, description="By number of samples, the last of all; empty if it failed"
+    )
     more_helps: bool = Field(description="Whether more samples of the same motion reduce the error beyond chance")
     variety_helps: bool = Field(description="Whether other motion reduces the error beyond chance")
     text: str = Field(max_length=300, description="The conclusion, in a sentence or two")

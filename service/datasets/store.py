@@ -15,6 +15,7 @@ from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
@@ -215,8 +216,7 @@ def make_preview(
 ) -> Preview:
     """Thin the quantities of all joints to at most `points` points per column; t, episode: (N,)."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(episode)) + 1])
-    if len(starts) > MAX_PREVIEW_STARTS:
-        starts = starts[np.linspace(0, len(starts) - 1, MAX_PREVIEW_STARTS).astype(np.int64)]
+    starts = starts[spaced_rows(len(starts), MAX_PREVIEW_STARTS)]
     columns = []
     for quantity in quantities:
         for name, (rows, values) in zip(joint_names, extremes(len(t), quantity, read, points), strict=True):

@@ -10,6 +10,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
 from lipcore.profiles import profile, recognise
@@ -205,7 +206,7 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
         with _splitting():
             part = np.flatnonzero(_split_of(loaded, dataset, served).held_out(episode, t)).astype(np.int64)
     chosen = _within(part, request, len(t))
-    rows = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), request.points)).round().astype(np.int64)]
+    rows = chosen[spaced_rows(len(chosen), request.points)]
     samples = Samples(served.model.joint_names, **sample_file.read(path, rows))
     deflections = sample_file.follow(sample_file.Reader(path), rows, served.model.joint_types)
     samples = replace(samples, deflections=deflections)

@@ -9,6 +9,7 @@ import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.data.motion import spaced_rows
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
@@ -136,7 +137,7 @@ def _read_rows(session: Session, model: str, stream_id: str, since: float) -> Ro
     of_stream = EventRow.model == model, EventRow.stream_id == stream_id, EventRow.kind == "batch"
     since_then = select(EventRow.number).where(*of_stream, EventRow.last >= since).order_by(EventRow.number)
     numbers = list(session.scalars(since_then))
-    places = np.unique(np.linspace(0, len(numbers) - 1, min(len(numbers), MAX_BATCHES)).round().astype(int))
+    places = spaced_rows(len(numbers), MAX_BATCHES)
     chosen = EventRow.model == model, EventRow.number.in_([numbers[place] for place in places])
     parts = [log.rows_of(event) for event in session.scalars(select(EventRow).where(*chosen))]
     if not parts:

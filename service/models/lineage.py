@@ -16,6 +16,7 @@ import scipy
 from lipcore.data import metrics
 from lipcore.data.coverage import coverage_interval
 from lipcore.data.metrics import TorqueDistribution
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
 from lipcore.model.acceptance import HeldOutFigures
@@ -76,8 +77,7 @@ def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[st
     N·m, nlpd in nats, coverage of the 95 % interval and the interval's width in N·m. The confidence interval of the
     coverage counts `independent` errors.
     """
-    count = min(len(samples), most)
-    used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
+    used = samples.rows(spaced_rows(len(samples), most))
     answer = answer_of(model, used)
     compared = metrics.evaluate(used.tau, *answer)
     per_joint = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data import independence, outliers
+from lipcore.data.motion import spaced_rows
 from lipcore.data.outliers import CorruptRows, CorruptRowsError
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask
@@ -256,7 +257,7 @@ def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples 
     stretches = [table.stretches()] if table.parts else []
     if logged is not None:
         count = min(log_rows, max(1, round(MAX_CANDIDATE_ROWS * log_rows / total))) if many else log_rows
-        parts.append(logged.rows(np.linspace(0, log_rows - 1, count).round().astype(np.int64)))
+        parts.append(logged.rows(spaced_rows(log_rows, count)))
         stretches.append(logged)
     return Samples.concatenate(parts), Samples.concatenate(stretches) if many else None
 

@@ -14,7 +14,7 @@ from lipcore.model.selection import MAX_NAME, shortened
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
 from lipcore.training.conditioning import should_condition
-from lipcore.training.learning_curve import learning_curve
+from lipcore.training.learning_curve import LearningCurve, learning_curve
 from lipcore.training.refit import refit, widen_intervals
 from lipcore.training.train import fit_model
 from lipcore.vocabulary import JointType
@@ -78,12 +78,16 @@ class PlannedFit:
             return replace(judged, fit={**judged.fit, REFIT_ERROR: why})
 
     def learning_curve(self, judged: TorqueModel, held_out: Samples, heartbeat: Heartbeat) -> dict[str, Any] | None:
-        """Return the learning curve of the judged model for its lineage; None if it cannot be computed."""
+        """Return the learning curve of the judged model for its lineage; None if there are too few samples.
+
+        If it fails, it has no points, and its text tells the error.
+        """
         try:
             curve = learning_curve(judged, self._task(None, heartbeat), held_out)
-        except (ArithmeticError, ValueError):
-            logger.exception("the learning curve failed; the version has none")
-            return None
+        except (ArithmeticError, ValueError) as error:
+            logger.exception("the learning curve failed")
+            why = shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]
+            curve = LearningCurve((), False, False, f"The learning curve could not be computed: {why}")
         return None if curve is None else asdict(curve)
 
     def _task(self, on_progress: Progress | None, heartbeat: Heartbeat) -> Task:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.online.batch import Rows
 from service.journal import log
@@ -194,7 +195,7 @@ def _thinned(
     kept = [pair for pair in kept if len(pair[0])]
     if held > most:
         chosen_rows = np.zeros(held, dtype=bool)
-        chosen_rows[np.linspace(0, held - 1, most).round().astype(np.int64)] = True
+        chosen_rows[spaced_rows(held, most)] = True
         kept = _where(kept, chosen_rows)
     return kept, count
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lipcore.data import independence
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask, Numbers
 from lipcore.training.conditioning import SHARD
@@ -91,7 +92,7 @@ class TablePart:
         clock = self.clock()
         order = np.lexsort((clock.t, clock.episode))
         order = order if self.chosen is None else order[self.chosen[order]]
-        places = np.linspace(0, len(order) - 1, min(len(order), most)).round().astype(np.int64)
+        places = spaced_rows(len(order), most)
         index, back = np.unique(order[places], return_inverse=True)
         values = {name: array[back] for name, array in self.reader.take(index).items()}
         deflections = self._deflections(index)
@@ -147,7 +148,7 @@ class Table:
 
     def thinned(self, most: int) -> Samples:
         """Return all rows, thinned evenly to at most `most`."""
-        return self.take(np.linspace(0, len(self) - 1, min(len(self), most)).round().astype(np.int64))
+        return self.take(spaced_rows(len(self), most))
 
     def stretches(self) -> Samples:
         """Return contiguous rows from all over the table."""

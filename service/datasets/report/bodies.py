@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.drive.terms import SIGN_WIDTH
@@ -240,7 +241,7 @@ def find_joint_order(bodies: Bodies, signals: Signals, comparison: Comparison) -
     Candidates are the alphabetical order, the reverse and rotations. Exchanges of two joints improve the best one.
     """
     rows, n = signals.q.shape
-    few = Signals(*(each[np.linspace(0, rows - 1, min(rows, BODIES.rows)).astype(np.int64)] for each in signals))
+    few = Signals(*(each[spaced_rows(rows, BODIES.rows)] for each in signals))
     scores: dict[tuple[int, ...], float] = {}
 
     def error(order: tuple[int, ...]) -> float:

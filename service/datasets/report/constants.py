@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array
 from lipcore.profiles import Profile
 from service.datasets.mapping.choice import format_numbers
@@ -41,7 +42,7 @@ def estimate_constants(prepared: Prepared, robot: Profile) -> EstimatedConstants
     Raise InvalidDataError if no joint shows its constant.
     """
     staged = prepared.staged
-    names, rows = staged.joint_names, np.linspace(0, staged.rows - 1, min(staged.rows, MAX_ROWS)).astype(np.int64)
+    names, rows = staged.joint_names, spaced_rows(staged.rows, MAX_ROWS)
     bodies = bodies_of(robot, names)
     if bodies is None:
         raise _missing(len(names), f"robot {robot.name} has no URDF with masses of these joints")

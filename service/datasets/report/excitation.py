@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Motion, spaced_rows
 from lipcore.data.samples import Array
 from lipcore.extras import MissingExtraError
 from lipcore.kernels.arm import ArmKernel
@@ -246,7 +246,7 @@ def judge_rigid_bodies(
         return texts.bodies_unusable(name, error)
     n, size = len(names), len(names) * PARAMETERS
     reference = _reference(kernel, limits)
-    rows = np.linspace(0, len(motion[0]) - 1, min(len(motion[0]), REFERENCE.max_equations // n)).astype(np.int64)
+    rows = spaced_rows(len(motion[0]), REFERENCE.max_equations // n)
     q, dq, ddq, tau = (each[rows] for each in (*motion, tau))
     gram, projected = np.zeros((size, size)), np.zeros(size + len(BASE_TERMS) * n)
     information = np.zeros((len(projected), len(projected)))

@@ -8,6 +8,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array
 from lipcore.data.signals import DIFFERENCE_ORDERS
 from lipcore.profiles import Profile
@@ -45,7 +46,7 @@ def thin(part: Rows, max_rows: int, margin: int = 0) -> Rows:
     total = int(before[-1])
     if total == 0:
         return np.zeros(0, np.int64)
-    chosen = np.arange(total) if total <= max_rows else np.linspace(0, total - 1, max_rows).astype(np.int64)
+    chosen = spaced_rows(total, max_rows)
     home = np.searchsorted(before, chosen, side="right") - 1
     return np.asarray(starts[home] + chosen - before[home], np.int64)
 
@@ -291,7 +292,7 @@ def is_smoothed(values: Array, part: Rows, level: float | None) -> bool:
     )
     if len(firsts) == 0:
         return False
-    firsts = firsts[np.linspace(0, len(firsts) - 1, min(len(firsts), SMOOTHING.max_pieces)).astype(np.int64)]
+    firsts = firsts[spaced_rows(len(firsts), SMOOTHING.max_pieces)]
     pieces = values[firsts[:, None] + np.arange(SMOOTHING.rows)]
     window = np.hanning(SMOOTHING.rows)
     power = np.median(np.abs(np.fft.rfft((pieces - pieces.mean(1, keepdims=True)) * window, axis=1)) ** 2, axis=0)

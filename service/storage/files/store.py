@@ -21,6 +21,7 @@ from typing import TypeVar
 import numpy as np
 from sqlalchemy import select
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Samples
 from lipcore.files import persistence
 from lipcore.files.durable import make_folder
@@ -126,7 +127,7 @@ class Files:
             chosen = np.flatnonzero(part(episode, t))
         count = sample_file.count_rows(path) if chosen is None else len(chosen)
         if most is not None and count > most:
-            thinned = np.linspace(0, count - 1, most).round().astype(np.int64)
+            thinned = spaced_rows(count, most)
             chosen = thinned if chosen is None else chosen[thinned]
         found = Samples(joint_names=tuple(joint_names), **sample_file.read(path, chosen))
         if joint_types is None:

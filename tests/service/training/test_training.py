@@ -1,13 +1,16 @@
 """A training job from the request to the version that it creates."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from lipcore.data.outliers import CorruptRows
+from lipcore.posterior.linalg import NotPositiveDefiniteError
 from service.contract.models import HoldoutLineage
 from service.datasets import staging
+from service.training import planned_fit
 from service.training.pulse import Heartbeat
 from tests.service.data import (
     ENDLESS,
@@ -125,6 +128,19 @@ def test_version_keeps_its_learning_curve(api):
     assert [point.spread for point in curve.points] == [True, True, False, True]
     assert curve.points[-1].nmse == pytest.approx(np.mean(stored["nmse"]), rel=0.01)
     assert "samples" in curve.text
+
+
+def test_version_states_why_it_has_no_learning_curve(api, run_here, monkeypatch):
+    failure = Mock(side_effect=NotPositiveDefiniteError("the matrix is singular"))
+    monkeypatch.setattr(planned_fit, "learning_curve", failure)
+    dataset = upload(api, stream(samples=150, seed=6))["id"]
+    assert (
+        run_here(queue(api, "uncurved", dataset, options=QUICK, holdout={"share": 0.3})["id"])["state"] == "succeeded"
+    )
+    curve = HoldoutLineage.model_validate(version_of(api, "uncurved")["lineage"]["holdout"]).learning_curve
+    assert curve is not None
+    assert curve.points == []
+    assert curve.text == ("The learning curve could not be computed: NotPositiveDefiniteError: the matrix is singular")
 
 
 def test_convention_and_options_of_the_job_are_kept(api):

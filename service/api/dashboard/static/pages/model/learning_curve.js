@@ -9,6 +9,7 @@ import { card, table } from "../../ui.js";
 export function learningCurveCard({ lineage }) {
   const curve = lineage.holdout?.learning_curve;
   if (!curve) return null;
+  if (!curve.points.length) return card("Learning curve", h("p", {}, curve.text));
   const columns = [
     { label: "Training samples", numeric: true, cell: (row) => count(row.rows) },
     { label: "Chosen", cell: (row) => chosen(row, curve) },
