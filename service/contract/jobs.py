@@ -8,7 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.estimators.options import MAX_SEARCH_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, TORCH_ESTIMATORS, JointType
-from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
+from service.contract.holdout import Holdout
+from service.contract.models import VERSION, HeldOutQuality, ModelName
 from service.contract.states import JobState, PromotionOption
 from service.foundation.fields import MAX_NAME_CHARS, MAX_NAMES
 

@@ -16,7 +16,8 @@ from pydantic import (
 )
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
-from service.contract.models import AliasName, Evaluation, VersionNumber
+from service.contract.holdout import Evaluation
+from service.contract.models import AliasName, VersionNumber
 from service.contract.payload import Payload
 from service.contract.states import Outcome
 from service.foundation.errors import invalid_request

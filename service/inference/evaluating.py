@@ -15,7 +15,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
 from lipcore.profiles import profile, recognise
 from service.contract import predictions as schema
-from service.contract.models import Evaluation, HoldoutLineage
+from service.contract.holdout import Evaluation, HoldoutLineage
 from service.datasets import store
 from service.foundation.errors import DamagedDataError, invalid_request
 from service.inference import texts

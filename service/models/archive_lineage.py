@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.files.entries import MAX_VALUE
-from service.contract.models import HoldoutLineage
+from service.contract.holdout import HoldoutLineage
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[float, Field(ge=0, le=MAX_VALUE)]

@@ -11,7 +11,7 @@ from lipcore.data import metrics
 from lipcore.data.coverage import CoverageInterval, coverage_interval
 from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics, TorqueDistribution
 from lipcore.data.samples import Array, Samples
-from service.contract.models import Interval, Reliability, Stretches
+from service.contract.holdout import Interval, Reliability, Stretches
 from service.foundation.fields import finite
 
 MAX_EVALUATION_SAMPLES = 5000

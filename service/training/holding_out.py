@@ -15,7 +15,7 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.data.splits import GUARD_S, Kind, Mask, Numbers, Split, SplitError, SplitRows, choose_stretches, split
-from service.contract.models import HeldOutSet, Holdout, HoldoutLineage
+from service.contract.holdout import HeldOutSet, Holdout, HoldoutLineage
 from service.foundation.errors import invalid_request
 from service.foundation.fields import first_repeat
 from service.storage.database import DatasetRow

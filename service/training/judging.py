@@ -7,7 +7,7 @@ from typing import Any
 from lipcore.data.metrics import BlockScores
 from lipcore.estimators.noise import white
 from lipcore.model.torque_model import TorqueModel
-from service.contract.models import Evaluation
+from service.contract.holdout import Evaluation
 from service.foundation.fields import finite
 from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
 from service.models.lineage import answer_of, figures

@@ -20,7 +20,7 @@ from lipcore.model.sibling import arm_as_expected, arm_of_sibling
 from lipcore.online.gates import MAX_GAP_S
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
-from service.contract.models import Holdout, HoldoutLineage
+from service.contract.holdout import Holdout, HoldoutLineage
 from service.datasets.mapping.checks import MIN_SAMPLES
 from service.journal import log
 from service.models import registry

@@ -19,7 +19,8 @@ from lipcore.estimators.base import RobotKind
 from lipcore.files.manifest import ModelFormatError
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.torque_model import TorqueModel
-from service.contract.models import HoldoutLineage, Promotion
+from service.contract.holdout import HoldoutLineage
+from service.contract.models import Promotion
 from service.contract.states import PromotionOption
 from service.models import aliases, registry
 from service.models.lineage import answer_of, held_out_figures, learnt_from

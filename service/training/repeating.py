@@ -9,7 +9,7 @@ from typing import Any
 from lipcore.data.repetition import Repetition, repetition
 from lipcore.data.samples import Samples
 from lipcore.training import held_out
-from service.contract.models import Holdout
+from service.contract.holdout import Holdout
 from service.storage.database import Database, DatasetRow
 from service.storage.files import Files
 from service.training import holding_out, refresh_data

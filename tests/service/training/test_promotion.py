@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from service.contract.models import HeldOutBlocks, Promotion
+from service.contract.holdout import HeldOutBlocks
+from service.contract.models import Promotion
 from service.models.registry import serving_version
 from service.storage.database import LearnerRow, VersionRow
 from service.training.promotion import settle

@@ -8,7 +8,7 @@ import pytest
 
 from lipcore.data.outliers import CorruptRows
 from lipcore.posterior.linalg import NotPositiveDefiniteError
-from service.contract.models import HoldoutLineage
+from service.contract.holdout import HoldoutLineage
 from service.datasets import staging
 from service.training import planned_fit
 from service.training.pulse import Heartbeat
