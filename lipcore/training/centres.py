@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -88,8 +89,12 @@ class Centres:
     def whiten(self, near: Array) -> NDArray[np.float32]:
         """Return the features φ of correlations, (K, m) both."""
         features = near.astype(np.float32)
-        whiten_rows(self.root.astype(np.float32), features)
+        whiten_rows(self._single_root, features)
         return features
+
+    @cached_property
+    def _single_root(self) -> NDArray[np.float32]:
+        return self.root.astype(np.float32)
 
     def features(self, inputs: Array, rows: Indices, blocks: Blocks) -> tuple[NDArray[np.float32], Array]:
         """Return the features φ of N samples, (N, m), and their nearness, (N, sizes).

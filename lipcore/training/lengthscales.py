@@ -46,7 +46,7 @@ class LengthscaleOptions:
     """Shares of the noise in the variance of a start; the likelier is used."""
     min_gain_nats: float = 10.0
     """Min gain of the likelihood over noise alone. If it is less, the search ends early."""
-    max_lengthscale: float = 2.0
+    max_lengthscale: float = 4.0
     """Max lengthscale, in units of a start. Longer ones fit repeated motion better, but the residual then reaches far
     beyond it: on other motion, joint 4 of `schunk` had more error than with the arm alone."""
     max_variance: float = 10.0
