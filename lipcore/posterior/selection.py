@@ -66,26 +66,36 @@ class Pivots:
         return len(self.outputs)
 
 
-def pivots(
-    gram: Array, per_sample: int, most: int, residual: float, values: Array | None = None, by_value: int = 0
-) -> Pivots:
+@dataclass(frozen=True)
+class Interpolated:
+    """A function that a Gaussian process interpolates from the chosen outputs."""
+
+    values: Array
+    """(M,)."""
+    count: int
+    """Number of outputs that are each the one at which interpolation from those before has the largest error."""
+    weights: Array
+    """Factors on the residual variances that choose the other outputs, (M,)."""
+
+
+def pivots(gram: Array, per_sample: int, most: int, residual: float, function: Interpolated | None = None) -> Pivots:
     """Return at most `most` outputs, chosen until no residual variance exceeds `residual`.
 
-    gram: (M, M), outputs sample by sample, `per_sample` each. It is read column by column and not modified; values:
-    (M,), of a function. The first `by_value` outputs are each the one at which interpolation of the function from those
-    before has the largest error. All others have the largest residual variance.
+    gram: (M, M), outputs sample by sample, `per_sample` each. It is read column by column and not modified; function:
+    what the outputs must interpolate; without it, each has the largest residual variance.
     """
     size = len(gram)
     lower = np.zeros((min(most, size), size))  # L transposed, so that its columns are contiguous
     left = gram.diagonal().copy()
     stop = max(residual, 1e-13 * float(left.max()))  # below this, variances are rounding errors
     handicap = np.full((size,), 1 / PREFERENCE)
-    error = np.zeros(size) if values is None else values.copy()
+    function = function or Interpolated(np.zeros(size), 0, np.ones(size))
+    error = function.values
     chosen: list[int] = []
     residuals: list[float] = []
     while len(chosen) < len(lower) and float(left.max()) > stop:
         step = len(chosen)
-        gain = np.abs(error) * (left > stop) if step < by_value else left
+        gain = np.abs(error) * (left > stop) if step < function.count else left * function.weights
         pivot = int(((gain if gain.any() else left) * handicap).argmax())
         row = (gram[pivot] - lower[:step, pivot] @ lower[:step]) / np.sqrt(left[pivot])
         error = error - error[pivot] / row[pivot] * row

@@ -15,7 +15,7 @@ from lipcore.data.samples import Array
 from lipcore.data.splits import SplitRows
 from lipcore.kernels.residual import JointResidual
 from lipcore.posterior.linalg import add_diagonal, cholesky, whiten_rows
-from lipcore.posterior.selection import pivots
+from lipcore.posterior.selection import Interpolated, pivots
 
 Blocks = Sequence[tuple[slice, SplitRows]]
 """Contiguous blocks of N samples, which they cover, each with the rows to train on and to test."""
@@ -57,16 +57,17 @@ class Centres:
     ) -> tuple[Centres, Indices]:
         """Return centres, and their rows among K candidates.
 
-        Centres of fast answers are where the residual is large that the other blocks predict: what is learnt only there
-        must not choose them. The others are where the candidates are.
+        Centres of fast answers interpolate the residual that the other blocks predict: what is learnt only there must
+        not choose them. The others are where candidates are far from centres, and have large weights in the residual.
 
         candidates: inputs, (K, 4 n); lengthscales: (4 n,); values: residual, (K,), in any unit; noise: its variance
         over that of the residual, (K,); blocks: of the candidates.
         """
         some = (candidates / lengthscales).astype(np.float32).astype(np.float64)
         near = _correlations(some, some)
-        expected = predict_held_out(near, values, noise, blocks)
-        order = pivots(near, 1, OPTIONS.rich[-1], OPTIONS.open_share, expected, OPTIONS.fast)
+        expected, weights = predict_held_out(near, values, noise, blocks)
+        function = Interpolated(expected, OPTIONS.fast, np.abs(weights))
+        order = pivots(near, 1, OPTIONS.rich[-1], OPTIONS.open_share, function)
         rows = order.outputs
         return cls(lengthscales, some[rows], np.ascontiguousarray(order.lower[rows])), rows
 
@@ -113,11 +114,11 @@ class Centres:
         return features, nearness
 
 
-def predict_held_out(gram: Array, values: Array, noise: Array, blocks: Blocks) -> Array:
-    """Return the mean of a Gaussian process at K samples, (K,), each block from the others.
+def predict_held_out(gram: Array, values: Array, noise: Array, blocks: Blocks) -> tuple[Array, Array]:
+    """Return the mean of a Gaussian process at K samples, (K,), each block from the others, and all samples' weights.
 
-    With P = (K + R)⁻¹, samples S that are not trained on have the mean y_S − P_SS⁻¹ (P y)_S. gram: K, (K, K); values:
-    y, (K,); noise: diagonal of R, (K,).
+    With P = (K + R)⁻¹, samples S that are not trained on have the mean y_S − P_SS⁻¹ (P y)_S. The weights are P y, (K,).
+    gram: K, (K, K); values: y, (K,); noise: diagonal of R, (K,).
     """
     noisy, mean, change = gram.copy(), values.copy(), np.zeros(len(values))
     add_diagonal(noisy, noise)
@@ -127,7 +128,7 @@ def predict_held_out(gram: Array, values: Array, noise: Array, blocks: Blocks) -
         out = np.flatnonzero(~parts.train)
         change[out] = cholesky(inverse[np.ix_(out, out)]).solve(weights[out])
         mean[block] -= change[block]
-    return mean
+    return mean, weights
 
 
 def blocks_of(rows: Indices, blocks: Blocks) -> Blocks:

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from lipcore.data.motion import Motion
 from lipcore.posterior.linalg import NotPositiveDefiniteError, cholesky
-from lipcore.posterior.selection import PREFERENCE, pivots, spread_out
+from lipcore.posterior.selection import PREFERENCE, Interpolated, pivots, spread_out
 
 
 def test_repeated_samples_are_selected_once() -> None:
@@ -61,15 +61,17 @@ def test_first_outputs_are_where_the_interpolation_of_values_fails_most() -> Non
     places = np.random.default_rng(2).normal(size=(60, 2))
     gram = np.exp(-0.5 * cdist(places, places, "sqeuclidean"))
     values = np.sin(3 * places[:, 0]) * np.exp(-np.square(places[:, 1]))
-    found = pivots(gram, 1, 20, 1e-9, values, 8).outputs
+    weights = np.linspace(0.1, 1.0, 60)
+    found = pivots(gram, 1, 20, 1e-9, Interpolated(values, 8, weights)).outputs
     for count in range(8):
         some = found[:count]
-        weights = np.linalg.solve(gram[np.ix_(some, some)], values[some])
-        assert np.abs(values - gram[:, some] @ weights).argmax() == found[count]
+        error = values - gram[:, some] @ np.linalg.solve(gram[np.ix_(some, some)], values[some])
+        assert np.abs(error).argmax() == found[count]
     some = found[:8]
     explained = gram[:, some] @ np.linalg.solve(gram[np.ix_(some, some)], gram[some])
-    assert (1 - explained.diagonal()).argmax() == found[8]
-    assert pivots(gram, 1, 20, 1e-9, np.zeros(60), 8).outputs.tolist() == pivots(gram, 1, 20, 1e-9).outputs.tolist()
+    assert (weights * (1 - explained.diagonal())).argmax() == found[8]
+    nothing = Interpolated(np.zeros(60), 8, np.zeros(60))
+    assert pivots(gram, 1, 20, 1e-9, nothing).outputs.tolist() == pivots(gram, 1, 20, 1e-9).outputs.tolist()
 
 
 def test_factor_solves_whitens_and_has_log_determinant() -> None:

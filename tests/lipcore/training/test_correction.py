@@ -146,12 +146,13 @@ def test_each_block_is_predicted_from_the_others():
     inputs, values = residual_inputs(samples.motion())[some], samples.tau[some, 0]
     gram, noise = np.exp(-0.5 * cdist(inputs, inputs, "sqeuclidean")), np.linspace(0.1, 0.3, len(some))
     blocks = centres.blocks_of(some, held_out_blocks(samples))
-    found = centres.predict_held_out(gram, values, noise, blocks)
+    found, weights = centres.predict_held_out(gram, values, noise, blocks)
+    np.testing.assert_allclose((gram + np.diag(noise)) @ weights, values, rtol=1e-8, atol=1e-10)
     assert [len(found[block]) for block, _ in blocks] == [10] * 10
     for block, parts in blocks:
         train = np.flatnonzero(parts.train)
-        weights = np.linalg.solve(gram[np.ix_(train, train)] + np.diag(noise[train]), values[train])
-        np.testing.assert_allclose(found[block], gram[block][:, train] @ weights, rtol=1e-8, atol=1e-10)
+        own = np.linalg.solve(gram[np.ix_(train, train)] + np.diag(noise[train]), values[train])
+        np.testing.assert_allclose(found[block], gram[block][:, train] @ own, rtol=1e-8, atol=1e-10)
 
 
 def test_fast_centres_are_where_others_predict_the_residual():
