@@ -67,7 +67,7 @@ class Pivots:
 
 
 @dataclass(frozen=True)
-class Interpolated:
+class TargetFunction:
     """A function that a Gaussian process interpolates from the chosen outputs."""
 
     values: Array
@@ -78,7 +78,7 @@ class Interpolated:
     """Factors on the residual variances that choose the other outputs, (M,)."""
 
 
-def pivots(gram: Array, per_sample: int, most: int, residual: float, function: Interpolated | None = None) -> Pivots:
+def pivots(gram: Array, per_sample: int, most: int, residual: float, function: TargetFunction | None = None) -> Pivots:
     """Return at most `most` outputs, chosen until no residual variance exceeds `residual`.
 
     gram: (M, M), outputs sample by sample, `per_sample` each. It is read column by column and not modified; function:
@@ -89,7 +89,7 @@ def pivots(gram: Array, per_sample: int, most: int, residual: float, function: I
     left = gram.diagonal().copy()
     stop = max(residual, 1e-13 * float(left.max()))  # below this, variances are rounding errors
     handicap = np.full((size,), 1 / PREFERENCE)
-    function = function or Interpolated(np.zeros(size), 0, np.ones(size))
+    function = function or TargetFunction(np.zeros(size), 0, np.ones(size))
     error = function.values
     chosen: list[int] = []
     residuals: list[float] = []

@@ -15,7 +15,7 @@ from lipcore.data.samples import Array
 from lipcore.data.splits import SplitRows
 from lipcore.kernels.residual import JointResidual
 from lipcore.posterior.linalg import add_diagonal, cholesky, whiten_rows
-from lipcore.posterior.selection import Interpolated, pivots
+from lipcore.posterior.selection import TargetFunction, pivots
 
 Blocks = Sequence[tuple[slice, SplitRows]]
 """Contiguous blocks of N samples, which they cover, each with the rows to train on and to test."""
@@ -66,7 +66,7 @@ class Centres:
         some = (candidates / lengthscales).astype(np.float32).astype(np.float64)
         near = _correlations(some, some)
         expected, weights = predict_held_out(near, values, noise, blocks)
-        function = Interpolated(expected, OPTIONS.fast, np.abs(weights))
+        function = TargetFunction(expected, OPTIONS.fast, np.abs(weights))
         order = pivots(near, 1, OPTIONS.rich[-1], OPTIONS.open_share, function)
         rows = order.outputs
         return cls(lengthscales, some[rows], np.ascontiguousarray(order.lower[rows])), rows

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from lipcore.data.motion import Motion
 from lipcore.posterior.linalg import NotPositiveDefiniteError, cholesky
-from lipcore.posterior.selection import PREFERENCE, Interpolated, pivots, spread_out
+from lipcore.posterior.selection import PREFERENCE, TargetFunction, pivots, spread_out
 
 
 def test_repeated_samples_are_selected_once() -> None:
@@ -62,7 +62,7 @@ def test_first_outputs_are_where_the_interpolation_of_values_fails_most() -> Non
     gram = np.exp(-0.5 * cdist(places, places, "sqeuclidean"))
     values = np.sin(3 * places[:, 0]) * np.exp(-np.square(places[:, 1]))
     weights = np.linspace(0.1, 1.0, 60)
-    found = pivots(gram, 1, 20, 1e-9, Interpolated(values, 8, weights)).outputs
+    found = pivots(gram, 1, 20, 1e-9, TargetFunction(values, 8, weights)).outputs
     for count in range(8):
         some = found[:count]
         error = values - gram[:, some] @ np.linalg.solve(gram[np.ix_(some, some)], values[some])
@@ -70,7 +70,7 @@ def test_first_outputs_are_where_the_interpolation_of_values_fails_most() -> Non
     some = found[:8]
     explained = gram[:, some] @ np.linalg.solve(gram[np.ix_(some, some)], gram[some])
     assert (weights * (1 - explained.diagonal())).argmax() == found[8]
-    nothing = Interpolated(np.zeros(60), 8, np.zeros(60))
+    nothing = TargetFunction(np.zeros(60), 8, np.zeros(60))
     assert pivots(gram, 1, 20, 1e-9, nothing).outputs.tolist() == pivots(gram, 1, 20, 1e-9).outputs.tolist()
 
 
