@@ -15,13 +15,13 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-def spaced_rows(size: int, count: int) -> Indices:
-    """Return at most `count` of `size` row numbers, evenly spaced, with the first and the last.
+def spaced_rows(size: int, count: int, first: int = 0) -> Indices:
+    """Return at most `count` of `size` row numbers from `first` on, evenly spaced, with the first and the last.
 
     >>> spaced_rows(9, 3).tolist()
     [0, 4, 8]
     """
-    return np.linspace(0, size - 1, min(count, size)).round().astype(np.int64)
+    return np.linspace(first, first + size - 1, min(count, size)).round().astype(np.int64)
 
 
 def check_joint_types(joint_types: Sequence[str]) -> tuple[JointType, ...]:

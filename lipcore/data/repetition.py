@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask, Numbers
 
@@ -86,7 +87,7 @@ def nearest(states: Array, edges: Numbers) -> Iterator[tuple[Numbers, Array]]:
     states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Yields rows (R,), distances (R, B).
     """
     for first, last in pairwise(edges.tolist()):
-        rows = _evenly(first, last, OPTIONS.block_instants)
+        rows = spaced_rows(last - first, OPTIONS.block_instants, first)
         yield rows, np.sqrt(np.minimum.reduceat(_squares(states[rows], states), edges[:-1], axis=1))
 
 
@@ -117,7 +118,7 @@ def repetition(training: Samples, part: Samples, joint_types: Sequence[str]) -> 
 def measure_repeated_share(known: Array, states: Array) -> float:
     """Return the share of states (R, k) that have a similar state among the known states (N, k), in order of time."""
     limits, shares = _limits(known, np.concatenate([known, states])), []
-    rows = _evenly(0, len(states), OPTIONS.part_instants)
+    rows = spaced_rows(len(states), OPTIONS.part_instants)
     for few in np.array_split(rows, max(1, len(rows) // 100)):
         squares = _squares(states[few], known)
         nearest = squares.argmin(axis=1)
@@ -134,7 +135,7 @@ def measure_distinct_share(samples: Samples, joint_types: Sequence[str]) -> floa
     """
     states = features(samples, joint_types)
     limits, passes = _limits(states, states), []
-    for row in _evenly(0, len(states), OPTIONS.part_instants):
+    for row in spaced_rows(len(states), OPTIONS.part_instants):
         distances = np.sqrt(_squares(states[row : row + 1], states)[0])
         near, left = distances <= limits[row], distances > 2 * limits[row]
         inside = near[near | left]
@@ -152,7 +153,7 @@ def find_period(samples: Samples, joint_types: Sequence[str]) -> float | None:
     states = features(samples, joint_types)
     limits, lags, asked = _limits(states, states), [], 0
     ends = np.concatenate([np.flatnonzero(np.diff(samples.episode)) + 1, [len(samples)]])
-    for row in _evenly(0, len(samples), OPTIONS.part_instants // 2):
+    for row in spaced_rows(len(samples), OPTIONS.part_instants // 2):
         asked += 1
         end = ends[np.searchsorted(ends, row, side="right")]
         distances = np.sqrt(_squares(states[row : row + 1], states[row:end])[0])
@@ -195,8 +196,3 @@ def _squares(states: Array, others: Array) -> Array:
     products = states @ others.T
     squares = np.square(states).sum(axis=1)[:, None] - 2 * products + np.square(others).sum(axis=1)
     return np.asarray(np.maximum(squares, 0.0))
-
-
-def _evenly(first: int, last: int, most: int) -> Numbers:
-    """Return up to `most` evenly spaced row numbers from `first` to `last`, without `last`."""
-    return np.unique(np.linspace(first, last - 1, most).round().astype(np.int64))

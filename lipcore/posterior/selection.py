@@ -82,7 +82,7 @@ def pivots(gram: Array, per_sample: int, most: int, residual: float, function: T
     """Return at most `most` outputs, chosen until no residual variance exceeds `residual`.
 
     gram: (M, M), outputs sample by sample, `per_sample` each. It is read column by column and not modified; function:
-    what the outputs must interpolate; without it, each has the largest residual variance.
+    the outputs interpolate it; if it is None, each output has the largest residual variance.
     """
     size = len(gram)
     lower = np.zeros((min(most, size), size))  # L transposed, so that its columns are contiguous

@@ -15,7 +15,7 @@ import numpy as np
 from lipcore.data import metrics
 from lipcore.data.independence import thinned_weights
 from lipcore.data.metrics import LEVEL, quantile
-from lipcore.data.motion import Indices, spaced_rows
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S, SplitRows, apply_guard
 from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
@@ -100,12 +100,12 @@ def correct(
         left = used.tau - known.mean
         earlier = [JointResidual.none(n)] * n if before is None else before.joints
         begin = [each.lengthscales if len(each.centres) else None for each in earlier]
-        some = _evenly(len(used), OPTIONS.max_shape_rows)
+        some = spaced_rows(len(used), OPTIONS.max_shape_rows)
         own = thinned_weights(used.t[some])
         parts = max(OPTIONS.blocks, round(float(weights.sum()) / OPTIONS.part_weight))
         part = np.arange(len(some)) * parts // len(some)
         shapes = fit_shapes(inputs[some], left[some], own, part, begin)
-        candidates = _evenly(len(used), OPTIONS.max_candidates)
+        candidates = spaced_rows(len(used), OPTIONS.max_candidates)
         for j, shape in enumerate(shapes):
             if shape.gain < lengthscales.OPTIONS.min_gain_nats and begin[j] is None:
                 continue
@@ -142,12 +142,7 @@ def _used_rows(samples: Samples, max_rows: float = np.inf) -> Samples:
     """Return the rows that weights are learnt from, in order."""
     ordered = samples.rows(np.lexsort((samples.t, samples.episode)))
     count = min(OPTIONS.max_rows, max_rows, OPTIONS.rows_each * float(thinned_weights(ordered.t).sum()))
-    return ordered.rows(_evenly(len(samples), count))
-
-
-def _evenly(size: int, count: float) -> Indices:
-    """Return at most `count` of `size` rows, at least two, evenly spaced."""
-    return spaced_rows(size, max(2, round(min(count, size))))
+    return ordered.rows(spaced_rows(len(samples), max(2, round(count))))
 
 
 def held_out_blocks(samples: Samples) -> list[tuple[slice, SplitRows]]:

@@ -164,17 +164,20 @@ class _Search:
             found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
             return float(found.fun), np.asarray(found.x)
 
-        first, *others = OPTIONS.neighbours
-        effort = (first, OPTIONS.first_iterations) if len(starts) > 1 else (others[-1], OPTIONS.iterations)
+        stages = [(most, OPTIONS.iterations) for most in OPTIONS.neighbours]
+        if len(starts) == 1:
+            stages = stages[-1:]
+        else:
+            stages[0] = (OPTIONS.neighbours[0], OPTIONS.first_iterations)
         ends = [
-            descend([np.array([*logs, np.log(1 - share), np.log(share)]) for share in OPTIONS.noise_shares], *effort)
+            descend([np.array([*logs, np.log(1 - share), np.log(share)]) for share in OPTIONS.noise_shares], *stages[0])
             for logs in starts
         ]
         value, logs = min(ends, key=lambda end: end[0])
         weights, squares = self.weights[rows], np.square(values[rows])
         variance = max(float(weights @ squares) / float(weights.sum()), 1e-12)
         alone = 0.5 * float(weights.sum()) * (1 + np.log(variance))
-        for most in others if len(starts) > 1 else []:
+        for stage in stages[1:]:
             if alone - value >= OPTIONS.min_gain_nats:
-                value, logs = descend([logs], most, OPTIONS.iterations)
+                value, logs = descend([logs], *stage)
         return logs, alone - value

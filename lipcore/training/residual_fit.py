@@ -189,8 +189,7 @@ class JointFit:
         centres, chosen = Centres.choose(
             inputs[some], shape.lengthscales, values[some], white[some] / shape.variance, blocks_of(some, blocks)
         )
-        features, nearness = centres.features(inputs, some[chosen], blocks)
-        sizes = centres.sizes()
+        (features, nearness), sizes = centres.features(inputs, some[chosen], blocks), centres.sizes()
 
         def sums_of(place: int) -> BlockSums:
             return BlockSums.of(features[:, : sizes[place]], shape.variance, white, values, blocks)

@@ -74,8 +74,7 @@ class PlannedFit:
             return self._on_all_rows(settings, again, heartbeat)
         except (ArithmeticError, ValueError) as error:
             logger.exception("the final fit, on all rows, failed; the version keeps the judged fit")
-            why = shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]
-            return replace(judged, fit={**judged.fit, REFIT_ERROR: why})
+            return replace(judged, fit={**judged.fit, REFIT_ERROR: _reason(error)})
 
     def learning_curve(self, judged: TorqueModel, held_out: Samples, heartbeat: Heartbeat) -> dict[str, Any] | None:
         """Return the learning curve of the judged model for its lineage; None if there are too few samples.
@@ -86,8 +85,7 @@ class PlannedFit:
             curve = learning_curve(judged, self._task(None, heartbeat), held_out)
         except (ArithmeticError, ValueError) as error:
             logger.exception("the learning curve failed")
-            why = shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]
-            curve = LearningCurve((), False, False, f"The learning curve could not be computed: {why}")
+            curve = LearningCurve((), False, False, f"The learning curve could not be computed: {_reason(error)}")
         return None if curve is None else asdict(curve)
 
     def _task(self, on_progress: Progress | None, heartbeat: Heartbeat) -> Task:
@@ -113,3 +111,8 @@ class PlannedFit:
         if not self.pass_rows:
             return trained
         return all_rows(settings, trained, self.table, data.logged, self.options, heartbeat.cancelled, heartbeat.share)
+
+
+def _reason(error: Exception) -> str:
+    """Return the error as a short line."""
+    return shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]

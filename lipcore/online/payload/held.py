@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
@@ -142,7 +142,7 @@ class TrackedPayload:
                 prior,
                 estimate_from_prior(carrier, prior),
             )
-        rows = rows.take(spread_places(0, len(rows), OPTIONS.max_rows))
+        rows = rows.take(spaced_rows(len(rows), OPTIONS.max_rows))
         seen = replace(estimate(carrier, rows), eta=eta, covariance=covariance)
         every = max(1, round(count / len(rows)))
         return TrackedPayload(
@@ -188,11 +188,6 @@ class TrackedPayload:
             newer = replace(self.estimate, draws=refined.estimate.draws)
             return replace(self, estimate=newer, refined=refined.refined, begun=refined.begun)
         return replace(self, estimate=refined.estimate, refined=refined.refined, begun=refined.begun, due=refined.due)
-
-
-def spread_places(first: int, last: int, most: int) -> NDArray[np.int64]:
-    """Return up to `most` evenly spaced places from `first` to `last` − 1, both included."""
-    return np.unique(np.linspace(first, last - 1, min(most, last - first)).round().astype(np.int64))
 
 
 def no_rows(n: int) -> Rows:

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, LinearisedCarrier, PayloadPosterior
 from lipcore.online.batch import Rows
 from lipcore.online.payload.bodies import ANY_PAYLOAD, ETA_STD
-from lipcore.online.payload.held import TrackedPayload, no_rows, spread_places
+from lipcore.online.payload.held import TrackedPayload, no_rows
 from lipcore.online.payload.hypotheses import WINDOW, Cell, CellWindow, cells_of, split_cells
 from lipcore.online.payload.verdict import PRIOR, VERDICT, Gains, classify_state, find_pickup, probabilities
 from lipcore.robots.urdf import PARAMETERS
@@ -141,7 +142,7 @@ class PayloadTracker:
                 break
             ends.append((first, last))
             first = last
-        parts = [rows.take(spread_places(*each, OPTIONS.cell_rows)) for each in ends]
+        parts = [rows.take(spaced_rows(last - first, OPTIONS.cell_rows, first)) for first, last in ends]
         watch = replace(self, waiting=rows.take(slice(first, None)) if first < len(rows) else None)
         together = OPTIONS.together if len(parts) <= OPTIONS.together_in_bulk else OPTIONS.together_in_bulk
         for at in range(0, len(parts), together):

@@ -156,7 +156,7 @@ def test_each_block_is_predicted_from_the_others():
 
 
 def test_fast_centres_are_where_others_predict_the_residual():
-    """The last part of the motion is unlike the others: what is learnt there must not choose centres."""
+    """The last part of the motion differs from all others. Its torque must not choose the centres of fast answers."""
     rng = np.random.default_rng(3)
     places = np.concatenate([rng.uniform(-3, 3, (270, 1)), rng.uniform(20, 22, (30, 1))]) @ np.ones((1, 4)) / 2
     values = np.where(places[:, 0] < 0, np.sin(4 * places[:, 0]), 0.0) + np.where(places[:, 0] > 5, 9.0, 0.0)

@@ -140,7 +140,7 @@ def test_version_states_why_it_has_no_learning_curve(api, run_here, monkeypatch)
     curve = HoldoutLineage.model_validate(version_of(api, "uncurved")["lineage"]["holdout"]).learning_curve
     assert curve is not None
     assert curve.points == []
-    assert curve.text == ("The learning curve could not be computed: NotPositiveDefiniteError: the matrix is singular")
+    assert curve.text == "The learning curve could not be computed: NotPositiveDefiniteError: the matrix is singular"
 
 
 def test_convention_and_options_of_the_job_are_kept(api):
