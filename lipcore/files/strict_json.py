@@ -30,8 +30,7 @@ def read(payload: bytes, max_bytes: int) -> Any:
     except RecursionError:
         raise StrictJsonError(f"it nests more than {MAX_DEPTH} deep") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        reason = str(error).removeprefix("JSON is malformed: ")
-        raise StrictJsonError(f"it is not JSON: {reason}") from None
+        raise StrictJsonError(f"it is not JSON: {mistake(payload, error)}") from None
     _check_tree(value, MAX_DEPTH)
     return value
 
@@ -46,6 +45,16 @@ def decode(decoder: msgspec.json.Decoder[T], payload: bytes, max_bytes: int) -> 
         return decoder.decode(payload)
     except msgspec.ValidationError as error:
         raise StrictJsonError(_explain(str(error), value)) from None
+
+
+def mistake(payload: bytes, error: Exception) -> str:
+    """Return why msgspec could not decode a document. It names the first byte that is not UTF-8, in any version."""
+    if "utf-8" in str(error).lower():
+        try:
+            payload.decode()
+        except UnicodeDecodeError as found:
+            return str(found)
+    return str(error).removeprefix("JSON is malformed: ")
 
 
 def check_texts(where: str, value: Any) -> None:

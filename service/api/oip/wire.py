@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.files.strict_json import mistake
 from service.api.oip.schema import (
     HEADER,
     SEQUENCE_ID,
@@ -157,7 +158,7 @@ def _explain(error: Exception, text: bytes, alone: bool) -> InvalidRequestError:
     for path, value in _leaves(loose):
         if isinstance(value, float) and not isfinite(value):  # Python and others write NaN, which is not JSON
             return invalid_request(path or "the body", value, "a finite number" if path else "an object")
-    reason = f"not JSON: {str(error).removeprefix('JSON is malformed: ')}"
+    reason = f"not JSON: {mistake(text, error)}"
     if alone:
         message = f"The body is {reason}. If binary tensors follow the JSON, give its length in {HEADER}."
     else:
