@@ -3,28 +3,38 @@
     many_rows.py panda ROWS...               the first rows of a recording of a simulated Panda with `Dirt` at 20 Hz
     many_rows.py shards COUNT                COUNT recordings of 44 000 rows of the same Panda
     many_rows.py sarcos FILE ROWS [SEED...]  random splits of SARCOS' test file, compared with kernel ridge regression
+    many_rows.py repeat [FRICTION_WALK_S]    the same Panda learns from an hour of a motion that repeats every 10 s
 
 The test of the Panda is other motion of the same kind. Errors are the squared error over the variance of the test
 torque. Coverage is that of the 95 % interval. Memory is the peak of one process.
 """
 
 import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from benchmarks.real.product import Bed, open_bed
+from benchmarks.real.rivals import Forecast
 from benchmarks.studies.dirty_arms import recorded, recording
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.samples import Array, Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import PERIOD_S
 
 SECONDS = 2200.0
 """Duration of a recording of the simulated arm."""
 TEST_ROWS = 1200
 """Rows of each of the three parts of another recording that are the test."""
+FIRST_S, HOUR_S, NOISE_S = 60.0, 3600.0, 60.0
+"""Durations of the first recording, of the repeated motion, and of a recording to measure the noise with."""
+REFRESHED = 5, 20
+"""Minutes after which the model is refreshed."""
 RIDGES = tuple(10.0**power for power in range(-6, 2))
 STARTS, FACTORS = (0.05, 0.1, 0.2, 0.4), (0.5, 0.7, 1.4, 2.0)
 """Scales of kernel ridge regression: the first, equal ones, and changes of one."""
@@ -100,9 +110,84 @@ def train(bed: Bed, name: str, parts: list[Samples], test: Samples, types: tuple
     return f"| {rows} | {' | '.join(found)} | {trained.seconds:.0f} | {trained.peak_mb} |"
 
 
+def repeat(bed: Bed, friction_walk_s: float | None) -> None:
+    """Print errors over the noise of the torque, for each minute; rows are predicted before they are learnt.
+
+    The arm starts cold: its friction falls by 13 % in some minutes. The model was trained on FIRST_S of other motion,
+    and is refreshed after some minutes, while the stream waits.
+    """
+    robot, dirt = load_robot("panda"), Dirt(seed=0)
+    silent = replace(dirt, noise=0.0)
+    noisy, clean = (recorded(robot, recording(NOISE_S, each), 100) for each in (dirt, silent))
+    noise = (noisy.tau - clean.tau).std(axis=0)
+    first = recorded(robot, recording(FIRST_S, dirt), 100)
+    hour = recorded(robot, replace(recording(HOUR_S + 2 * PERIOD_S, dirt), course="periodic", speed=1.0), 300)
+    hour = replace(hour, t=hour.t - PERIOD_S)  # the low-pass is wrong at both ends
+    hour = hour.rows((hour.t > -1e-9) & (hour.t < HOUR_S - 1e-9))
+    bed.train("repeat", [bed.upload("repeat", first)], robot.joint_types, None)
+    bed.client.set_learning("repeat", auto_refresh=False, friction_walk_s=friction_walk_s)
+    print("| minute | version | error / noise | joint by joint | fast | coverage, % |\n|" + " --- |" * 6)
+    for minute, cycles in enumerate(by_minute(hour), start=1):
+        answers = []
+        for number, cycle in cycles:
+            past = hour.rows(slice(max(0, (number - 1) * len(cycle)), number * len(cycle)))
+            answers.append((cycle.tau, ask(bed, past, cycle), ask_fast(bed, past, cycle)))
+            learn(bed, number, cycle)
+        measured, mean, std, fast = (
+            np.concatenate(parts)
+            for parts in zip(*((tau, rich.mean, rich.std, fast) for tau, rich, fast in answers), strict=True)
+        )
+        whole, quick = (np.sqrt(np.mean(np.square(measured - each), axis=0)) / noise for each in (mean, fast))
+        inside = 100 * np.mean(np.abs(measured - mean) <= quantile(LEVEL) * std)
+        joints = " ".join(f"{value:.2f}" for value in whole)
+        version = bed.client.model("repeat").serving_version
+        row = minute, version, f"{whole.mean():.2f}", joints, f"{quick.mean():.2f}", f"{inside:.1f}"
+        print(f"| {' | '.join(map(str, row))} |", flush=True)
+        if minute in REFRESHED:
+            bed.client.wait(bed.client.refresh("repeat"))
+
+
+def by_minute(samples: Samples) -> Iterator[list[tuple[int, Samples]]]:
+    """Yield the numbered cycles of each minute."""
+    ends = np.arange(1, round(HOUR_S / PERIOD_S) + 1) * PERIOD_S
+    rows = np.searchsorted(samples.t, np.concatenate([[0.0], ends]) - 1e-9)
+    each = [(number, samples.rows(slice(*rows[number : number + 2]))) for number in range(len(ends))]
+    step = round(60.0 / PERIOD_S)
+    yield from (each[start : start + step] for start in range(0, len(each), step))
+
+
+def ask(bed: Bed, past: Samples, rows: Samples) -> Forecast:
+    """Predict rows after others, by the serving version."""
+    history = (past.t, past.q, past.dq) if len(past) else None
+    answer = bed.client.predict("repeat", rows.q, rows.dq, rows.ddq, t=rows.t, history=history)
+    low, high = answer.interval(LEVEL)
+    return Forecast(answer.tau, (high - low) / (2 * quantile(LEVEL)))
+
+
+def ask_fast(bed: Bed, past: Samples, rows: Samples) -> Array:
+    """Predict rows after others by a stream, which answers faster."""
+    every = Samples.concatenate([past, rows]) if len(past) else rows
+    with bed.client.stream("repeat") as stream:
+        answers = [stream.predict(*motion) for motion in zip(every.q, every.dq, every.ddq, strict=True)]
+    return np.array([answer.tau for answer in answers[len(past) :]])
+
+
+def learn(bed: Bed, number: int, rows: Samples) -> None:
+    """Send rows to learn from and wait until answers contain them."""
+    sent = bed.client.observe("repeat", "cell", number, rows.q, rows.dq, rows.tau, rows.ddq, t=rows.t)
+    if sent.accepted < len(rows):
+        print(f"  {sent.rejected}", file=sys.stderr)
+    motion = rows.q[0], rows.dq[0], rows.ddq[0]
+    while bed.client.predict("repeat", *motion).revision < sent.revision:
+        time.sleep(0.02)
+
+
 def main() -> None:
     """Print a Markdown table."""
     what, *arguments = sys.argv[1:]
+    if what == "repeat":
+        with open_bed(1) as bed:
+            return repeat(bed, float(arguments[0]) if arguments else None)
     print("| rows | error | joint by joint | coverage, % | estimator | job, s | memory, MB |\n|" + " --- |" * 7)
     with open_bed(1) as bed:
         if what == "sarcos":
