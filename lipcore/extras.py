@@ -35,7 +35,10 @@ EXTRAS = {
     "train": Extra("train the estimators se, gip and lse, on a GPU if there is one", ("torch",)),
     "robots": Extra("use URDFs", ("pinocchio",)),
     "sim": Extra("simulate robots and know them by name", ("pinocchio",), ROBOTS_DATA),
-    "ingest": Extra("read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra)", ("pyarrow",)),
+    "ingest": Extra(
+        "read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra)",
+        ("pyarrow", "clevercsv", "chardet", "dateutil"),
+    ),
     "cluster": Extra("share PostgreSQL, S3 and a Dask cluster", ("psycopg", "s3fs", "distributed")),
     "grpc": Extra("serve over gRPC", ("grpc", "google.protobuf")),
     "opentelemetry": Extra("send traces", ("opentelemetry.exporter.otlp.proto.http",)),

@@ -12,8 +12,10 @@ MEDIA_TYPES = {
     "application/x-rosbag": "rosbag1",
     "application/x-mcap": "mcap",
     "application/zip": "zip",
+    "application/gzip": "gzip",
+    "application/zstd": "zstd",
 }
-"""File type by media type. A zip holds a LeRobot or rosbag2 directory, or text tables to be joined."""
+"""File type by media type. A zip holds a LeRobot or rosbag2 directory, text tables to be joined, or one file."""
 SUFFIXES = {
     ".csv": "csv",
     ".tsv": "csv",
@@ -28,6 +30,8 @@ SUFFIXES = {
     ".bag": "rosbag1",
     ".mcap": "mcap",
     ".zip": "zip",
+    ".gz": "gzip",
+    ".zst": "zstd",
 }
 """File type by suffix."""
 _FIRST = {kind: media_type for media_type, kind in reversed(MEDIA_TYPES.items())}

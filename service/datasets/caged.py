@@ -28,11 +28,10 @@ def warm() -> None:
     for name in ("csv", "parquet", "bags.reading", "lerobot", "joined"):
         import_extra(f"service.datasets.formats.{name}", "ingest")
     # the first call of an Arrow function takes 50 ms to find it: once here, not in each forked process
-    arrow = import_module("service.datasets.formats.arrow")
-    cells = import_module("pyarrow").array(["1", "1.5", "a"])
-    arrow.NumberColumn("", decimal_comma=True).share(cells)
-    arrow.NumberColumn("", decimal_comma=True).read(cells[:2], 1)
-    arrow.StampColumn.of("", cells)
+    cells = import_module("service.datasets.formats.cells")
+    text = import_module("pyarrow").array(["1", "1.5", "a"])
+    cells.plan_cells("", text[2:], True, 10)
+    cells.NumberCells("", decimal_comma=True).read(text[:2], 1)
 
 
 class _WithoutPandas(MetaPathFinder):

@@ -23,6 +23,9 @@ from service.foundation.errors import invalid_data, readable
 from service.storage.disk import Disk, DiskBudget
 
 TIME, EPISODE = "t", "episode"
+NO_TIMES_HINT = (
+    '. Set dt=0.01 if the rows are 0.01 s apart, or columns={"t": "…"} if a column of another name holds the times'
+)
 QUANTITIES = ("q", "dq", "ddq", "tau")
 
 
@@ -177,7 +180,8 @@ def prepare(
         braked = find_braked_rows(t, numbers, raw.n_joints, read)
         made = plan(t, episode, missing, raw.quantities, recipe, damaged.rows, braked.rows)
     except (CorruptRowsError, PreparationError) as error:
-        raise invalid_data(error.field, error.value, error.expected, str(error)) from None
+        hint = NO_TIMES_HINT if (error.field, error.value) == (TIME, "missing") else ""
+        raise invalid_data(error.field, error.value, f"{error.expected}{hint}", f"{error}{hint}") from None
     if len(made) < min_samples:
         why = "trimming the filter's edges" if made.cutoff is not None else "dropping unusable rows"
         raise invalid_data("rows", len(made), f"at least {min_samples} samples after {why}")

@@ -1,4 +1,4 @@
-"""Converting Arrow columns to columns of numbers: text cells, lists (`name[0]`) and structures (`name.part`)."""
+"""Converting Arrow columns to columns of numbers: numbers, times, lists (`name[0]`) and structures (`name.part`)."""
 
 from __future__ import annotations
 
@@ -12,93 +12,7 @@ from lipcore.data.samples import Array
 from service.datasets.formats.table import SAME_LENGTH
 from service.foundation.errors import invalid_data
 
-NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-MISSING = ("", "NA", "N/A", "<NA>", "na", "null", "NULL", "None")
-"""Cells that mean a missing value. `nan` in any case is a number."""
-_PATTERN = rf"(?i)^(?:{NUMBER}|[+-]?(?:nan|inf(?:inity)?))$"
-_COMMA = r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$"
 _INT_MIN = np.iinfo(np.int64).min
-
-
-class NumberColumn:
-    """A text column of numbers; a missing cell becomes NaN.
-
-    decimal_comma: whether cells such as `1,5` are allowed; `commas` is True after one was found.
-    """
-
-    def __init__(self, name: str, decimal_comma: bool) -> None:
-        self.name, self.decimal_comma = name, decimal_comma
-        self.commas = False
-
-    def read(self, column: pa.Array, first_row: int) -> Array:
-        """Read cells (rows,); raise InvalidDataError with the row, from 1, of the first that is not a number."""
-        if not self.commas:
-            try:
-                return _floats(pc.cast(column, pa.float64()))
-            except pa.ArrowInvalid:
-                pass  # rare: blanks, a plus, a decimal comma, a word for "missing", or not a number
-        text = self._tidy(column)
-        wrong = pc.invert(pc.fill_null(pc.match_substring_regex(text, _PATTERN), True))
-        if (first := pc.index(wrong, True).as_py()) >= 0:
-            raise invalid_data(f"{self.name}, row {first_row + first}", column[first].as_py() or "empty", "a number")
-        try:
-            return _floats(pc.cast(text, pa.float64()))
-        except pa.ArrowInvalid:  # too large for a double
-            return np.array([np.nan if cell is None else float(cell) for cell in text.to_pylist()])
-
-    def share(self, column: pa.Array) -> float:
-        """Return the share of non-empty cells that are numbers, 1 if all are empty."""
-        text = self._tidy(column)
-        filled = len(text) - text.null_count
-        return 1.0 if filled == 0 else (pc.sum(pc.match_substring_regex(text, _PATTERN)).as_py() or 0) / filled
-
-    def _tidy(self, column: pa.Array) -> pa.Array:
-        text = pc.utf8_trim_whitespace(column)
-        text = pc.if_else(pc.is_in(text, value_set=pa.array(MISSING)), pa.scalar(None, pa.string()), text)
-        text = pc.replace_substring_regex(text, r"^\+", "")
-        if self.decimal_comma and not self.commas:
-            marks = pc.match_substring_regex(text, _COMMA), pc.match_substring(text, ".")
-            commas, points = (pc.sum(each).as_py() or 0 for each in marks)
-            self.commas = 0 < commas >= points
-        if self.commas:  # then a point is not decimal; it can only separate thousands
-            text = pc.replace_substring_regex(pc.replace_substring(text, ".", "·"), _COMMA, r"\1.\2")
-        return text
-
-
-class StampColumn:
-    """A text column of dates with times (ISO 8601), read as seconds since the first one."""
-
-    def __init__(self, name: str, kind: pa.DataType) -> None:
-        self.name, self.kind = name, kind
-        self.origin: int | None = None
-
-    @staticmethod
-    def of(name: str, column: pa.Array) -> StampColumn | None:
-        """Return such a column if every non-empty cell is a date with a time, else None."""
-        if column.null_count == len(column):
-            return None
-        for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):
-            try:
-                pc.cast(pc.utf8_trim_whitespace(column), kind)
-            except (pa.ArrowInvalid, pa.ArrowNotImplementedError):
-                continue
-            return StampColumn(name, kind)
-        return None
-
-    def read(self, column: pa.Array, first_row: int) -> Array:
-        """Read cells (rows,) in s; raise InvalidDataError with the row of the first that is not a time."""
-        text = pc.utf8_trim_whitespace(column)
-        try:
-            stamps = pc.cast(text, self.kind)
-        except pa.ArrowInvalid:
-            for row, cell in enumerate(text):
-                try:
-                    pc.cast(cell, self.kind)
-                except pa.ArrowInvalid:
-                    raise invalid_data(f"{self.name}, row {first_row + row}", cell.as_py(), "a time") from None
-            raise
-        seconds, self.origin = since(stamps, self.origin, 1e-9)
-        return seconds
 
 
 def since(stamps: pa.Array, origin: int | None, unit: float) -> tuple[Array, int | None]:
@@ -110,11 +24,6 @@ def since(stamps: pa.Array, origin: int | None, unit: float) -> tuple[Array, int
     seconds = np.full(len(ticks), np.nan)
     seconds[given] = (ticks[given] - (origin or 0)) * unit
     return seconds, origin
-
-
-def _floats(column: pa.Array) -> Array:
-    values: Array = column.to_numpy(zero_copy_only=False)
-    return values
 
 
 class Node(Protocol):

@@ -103,7 +103,7 @@ class ColumnNamer:
                 "column_names=t,q1..q7,tau1..tau7 for all columns of such files in order"
             )
             raise invalid_data("header", "missing", expected)
-        expressly = any(word.text in COMMANDED | MEASURED for word in parts)
+        expressly = subject.kind == "current" or any(word.text in COMMANDED | MEASURED for word in parts)
         pattern = f"{stem}_" if expressly else subject.quantity
         return tuple(f"{pattern}{joint}" for joint in range(1, width + 1))
 

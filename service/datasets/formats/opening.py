@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import cast
 
@@ -12,6 +12,8 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.extras import import_extra
+from service.datasets.formats.compressed import MAGIC, unpacked
+from service.datasets.formats.encoding import decode_head
 from service.datasets.formats.joined import find_tables
 from service.datasets.formats.json import MAX_LINE_BYTES, decode, open_json, open_json_lines
 from service.datasets.formats.npz import open_npz
@@ -34,8 +36,12 @@ KINDS = {
     "rosbag1": "a ROS 1 bag",
     "rosbag2": "a ROS 2 bag",
     "mcap": "MCAP",
+    "gzip": "a file compressed with gzip",
+    "zstd": "a file compressed with zstd",
 }
 """Formats that can be read, in words."""
+PACKED = {"gzip": "gzip", "zstd": "zstd", "single": "zip"}
+"""Compression by format, of files that hold another one."""
 SIMILAR_KINDS: tuple[set[str | None], ...] = ({"json", "json_lines"}, {"rosbag1", "rosbag2", "mcap"})
 """Formats that are confused so often that the report does not mention it."""
 _MAGIC = (
@@ -43,6 +49,7 @@ _MAGIC = (
     (b"SQLite format 3\0", "rosbag2"),
     (b"\x89MCAP0\r\n", "mcap"),
     (b"#ROSBAG V2.0\n", "rosbag1"),
+    *MAGIC,
 )
 _UNSUPPORTED = (
     (b"\x89HDF\r\n\x1a\n", "HDF5"),
@@ -53,14 +60,10 @@ _UNSUPPORTED = (
     (b"\x80\x03", "a pickle"),
     (b"\x80\x04", "a pickle"),
     (b"\x80\x05", "a pickle"),
-    (b"\x1f\x8b", "compressed with gzip"),
-    (b"\x28\xb5\x2f\xfd", "compressed with zstd"),
     (b"BZh", "compressed with bzip2"),
     (b"\xfd7zXZ\0", "compressed with xz"),
     (b"7z\xbc\xaf\x27\x1c", "a 7z archive"),
     (b"Rar!", "a RAR archive"),
-    (b"\xff\xfe", "text in UTF-16"),
-    (b"\xfe\xff", "text in UTF-16"),
     (b"\x89PNG", "an image"),
     (b"\xff\xd8\xff", "an image"),
     (b"%PDF", "PDF"),
@@ -108,24 +111,21 @@ def _sniff_zip(path: Path) -> str | None:
         return "rosbag1"
     if find_tables(names):
         return "joined"
-    return "npz" if names and all(name.endswith(".npy") for name in names) else None
+    if names and all(name.endswith(".npy") for name in names):
+        return "npz"
+    return "single" if sum(not name.endswith("/") for name in names) == 1 else None
 
 
 def _sniff_text(head: bytes) -> str | None:
     """Return "json", "json_lines" or "csv" if the head of a file is such text."""
-    try:
-        text = head.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        if error.start < len(head) - 4 or len(head) < HEAD_BYTES:
-            return None
-        text = head[: error.start].decode("utf-8-sig")  # the head ends within a character
-    text = text.lstrip()
-    if not text or "\0" in text:
+    found = decode_head(head, len(head) < HEAD_BYTES)
+    text = "" if found is None else found[1].lstrip()
+    if not text or "\0" in text or text[0] == "<":
         return None
-    line, _, rest = text.partition("\n")
     if text[0] == "[":
         return "json"
     if text[0] == "{":
+        line, _, rest = text.partition("\n")
         try:
             row = decode(line.encode())
         except ValueError:
@@ -133,11 +133,8 @@ def _sniff_text(head: bytes) -> str | None:
         if rest.strip():
             return "json_lines"
         return "json" if any(isinstance(value, list | dict) for value in row.values()) else "json_lines"
-    # a line of comment marks alone becomes empty
-    while rest and (not (row := rest.partition("\n")[0].strip()) or line[:1] in "#%"):
-        line, _, rest = (row or line).lstrip("#%"), None, rest.partition("\n")[2]
-    marks = [mark for mark in ",;\t| " if mark in line and mark in row] if rest else []
-    return "csv" if marks and any(each.isdigit() for each in row) else None
+    lines = (line for line in text.splitlines() if line.strip(" #%"))
+    return "csv" if any(re.search(r"\d", line) and re.search(r"\S[,;\t| ]\s*\S", line) for line in lines) else None
 
 
 @contextmanager
@@ -150,6 +147,14 @@ def open_table(path: Path, kind: str | None, options: ReadOptions, settings: Set
     if path.stat().st_size == 0:
         raise invalid_data("file", "empty", KINDS.get(kind or "", "a recording"))
     actual = _decide_kind(path, kind)
+    if actual in PACKED:
+        with unpacked(path, PACKED[actual], settings) as inner:
+            if sniff(inner) in PACKED:
+                raise invalid_data("file", "compressed twice", "a recording, or one that is compressed once")
+            with open_table(inner, None, options, settings) as table:
+                table.facts.insert(0, f"the file was unpacked with {PACKED[actual]}")
+                yield table
+        return
     with _open(path, actual, options, settings) as table:
         if options.dt is not None:
             _add_times(table, options.dt)
@@ -192,7 +197,8 @@ def _decide_kind(path: Path, kind: str | None) -> str:
     raise invalid_data(
         "file",
         f"{other or 'in an unknown format'}{sent}",
-        "CSV, Parquet, NPZ, JSON, a ROS 1 or ROS 2 bag, MCAP, or a zip of a LeRobot data set, a bag or text tables",
+        "CSV, Parquet, NPZ, JSON, a ROS 1 or ROS 2 bag, MCAP, one of these in gzip, zstd or zip, or a zip of a LeRobot "
+        "data set, a bag or text tables",
     )
 
 
@@ -207,7 +213,7 @@ def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> Ab
         return own[kind](path, options, settings)
     import_extra("pyarrow", "ingest")  # the readers below need it
     if kind in ("csv", "parquet", "lerobot", "joined"):
-        opener: Opener = getattr(import_module(f"service.datasets.formats.{kind}"), f"open_{kind}")
+        opener: Opener = getattr(import_extra(f"service.datasets.formats.{kind}", "ingest"), f"open_{kind}")
         return opener(path, options, settings)
     from service.datasets.formats.bags.reading import BagKind, open_bag  # noqa: PLC0415
 

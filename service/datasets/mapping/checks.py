@@ -83,6 +83,10 @@ class ColumnStats:
         return max(0.0, self.high - self.low)
 
 
+JointStats = tuple[str, list[ColumnStats]]
+"""A joint and its columns."""
+
+
 class TurnUnwrapper:
     """Removes jumps of a whole turn from a joint's positions, which sensors wrap at ±π or 2π.
 
@@ -161,10 +165,16 @@ def check_episodes(values: Array, rows: Rows, name: str) -> None:
         raise invalid_data(f"{name}, row {rows[place]}", float(values[place]), "a whole number")
 
 
-def check_rows(rows: int, missing: int, repeated: int, min_samples: int, stats: list[ColumnStats]) -> None:
-    """Raise InvalidDataError if too few rows are complete and have a new time."""
+def check_rows(
+    rows: int, missing: int, repeated: int, min_samples: int, time: ColumnStats | None, joints: list[JointStats]
+) -> None:
+    """Raise InvalidDataError if too few rows are complete and have a new time. joints: with their columns."""
+    stats = [each for _, row in joints for each in row] + ([time] if time else [])
     if 2 * missing > rows:
         worst = max(stats, key=lambda each: each.missing)
+        if empty := [joint for joint, row in joints if any(each.missing == rows for each in row)]:
+            expected = f"numbers. Leave out joints without them with drop_joints={','.join(empty)}"
+            raise invalid_data(worst.name, "missing in all rows", expected)
         raise invalid_data(
             f"{worst.name}, row {worst.first_missing}",
             f"not a finite number, as in {worst.missing} of {rows} rows",
@@ -189,18 +199,22 @@ def check_positions(stats: list[tuple[str, ColumnStats]], max_position: float, h
             f'radians or metres within ±{max_position:g}. Set units={{"q": "deg"}} if these are degrees, or '
             'units={"q": "rad"} if the joint turns this far',
         )
-    for joint, each in stats:
-        if each.span < CHECKS.min_span:
-            expected = f"a joint that moves. Leave out locked joints with drop_joints={joint}"
-            raise invalid_data(each.name, f"constant at {each.low:g}", expected)
+    if locked := [(joint, each) for joint, each in stats if each.span < CHECKS.min_span]:
+        hint = "" if len(locked) == len(stats) else f". Leave out locked joints with {_drop(locked)}"
+        first = locked[0][1]
+        raise invalid_data(first.name, f"constant at {first.low:g}", f"a joint that moves{hint}")
 
 
 def check_torques(stats: list[tuple[str, ColumnStats]]) -> None:
     """Raise InvalidDataError if a torque is the same in all rows, because then it was not measured."""
-    constant = [(joint, each) for joint, each in stats if each.span == 0]
-    for joint, each in constant:
-        hint = "" if len(constant) == len(stats) else f". Leave out a joint without one with drop_joints={joint}"
-        raise invalid_data(each.name, f"constant at {each.low:g}", f"a torque measured while the joint moved{hint}")
+    if constant := [(joint, each) for joint, each in stats if each.span == 0]:
+        hint = "" if len(constant) == len(stats) else f". Leave out joints without one with {_drop(constant)}"
+        first = constant[0][1]
+        raise invalid_data(first.name, f"constant at {first.low:g}", f"a torque measured while the joint moved{hint}")
+
+
+def _drop(joints: list[tuple[str, ColumnStats]]) -> str:
+    return f"drop_joints={','.join(joint for joint, _ in joints)}"
 
 
 def check_epoch_unit(t: Array, rows: Rows, name: str) -> None:

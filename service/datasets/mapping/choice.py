@@ -213,6 +213,10 @@ class Families:
             if (family := self._choose(quantity, joints)) is not None:
                 out[quantity] = family
         for family in out.values():
+            if self.positions.numbered and len(self.positions.members) == 1 < len(family.members):
+                key = next(each for each in family.members if each not in self.positions.members)
+                expected = f"positions of all joints because there are torques {family.pattern.replace(JOINT, '1')}…"
+                raise invalid_data(f"column q{key}", "missing", expected)
             if family.repeated:
                 raise invalid_data(
                     f"column {family.repeated[0] + 1}", self.names[family.repeated[0]], "each column only once"
@@ -272,9 +276,12 @@ class Families:
             self._check_complete(max(parts, key=lambda each: (-each.rank, len(each.members))), joints)
         if quantity in MOTION:
             return None
-        expected = f"tau1..tau{len(joints)} because there are q1..q{len(joints)}"
+        key = joints[0].key if len(joints) == 1 and self.positions.numbered else 1
+        expected = (
+            f"tau1..tau{len(joints)} because there are q1..q{len(joints)}" if key == 1 else f"the torque of q{key}"
+        )
         hint = columns_hint({"tau": "…{joint}…"})
-        raise invalid_data("column tau1", "missing", f"{expected}. Set {hint} if they have other names")
+        raise invalid_data(f"column tau{key}", "missing", f"{expected}. Set {hint} if they have other names")
 
     def _check_complete(self, family: Family, joints: Sequence[Joint]) -> None:
         for joint in joints:

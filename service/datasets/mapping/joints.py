@@ -112,7 +112,7 @@ def _check_numbers(positions: Family) -> None:
     first = min(map(int, labels))
     # numbers start at 0 or 1 in the file, at 1 in the keys
     missing = next((place for place, key in enumerate(numbers, start=1) if key != place), None)
-    if missing is not None:
+    if missing is not None and len(numbers) > 1:
         name = positions.pattern.replace(JOINT, str(missing - (first == 0)))
         raise invalid_data(f"column {name}", "missing", f"positions of joints {first or 1} to {max(map(int, labels))}")
 

@@ -124,8 +124,9 @@ class _Reader:
         for quantity in self.absent:
             del self.stats[quantity]
         missing = self.staged.missing()
-        stats = [each for row in self.stats.values() for each in row] + ([self.time] if self.time else [])
-        checks.check_rows(len(missing), int(missing.sum()), self.times.repeated, self.min_samples, stats)
+        columns = [(joint, [row[j] for row in self.stats.values()]) for j, joint in enumerate(self.mapped.joints)]
+        rows = len(missing), int(missing.sum()), self.times.repeated
+        checks.check_rows(*rows, self.min_samples, self.time, columns)
         if self.mapped.t:
             checks.check_time_unit(self.staged.read(TIME), self.time_has_unit, self.mapped.t[0].name)
         joints = list(zip(self.mapped.joints, self.stats["q"], strict=True))

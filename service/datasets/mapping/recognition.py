@@ -230,7 +230,9 @@ def _end_with_bracket(name: str, start: int, end: int) -> int:
     return end + 1 if name[end : end + 1] == "]" and "[" in name[start:end] else end
 
 
-_TIMES = re.compile(r"(?:_*|%|elapsed[_ ]?|log[_ ]?|ros[_ ]?|robot[_ ]?)(?:t|time|times|timestamp|timestamps|stamp)")
+_TIMES = re.compile(
+    r"(?:_*|%|elapsed[_ ]?|log[_ ]?|ros[_ ]?|robot[_ ]?)(?:t|time|times|timestamp|timestamps|stamp)|(?:\w+_)?ts"
+)
 _SPLIT_STAMP = re.compile(r"(.*?)(nsecs?|nanosecs?|nanoseconds|secs?|seconds)")
 
 

@@ -72,6 +72,9 @@ PHRASES: dict[tuple[str, ...], tuple[str, str]] = {
     ("q", "dot"): ("dq", "velocity"),
     ("q", "dot", "dot"): ("ddq", "acceleration"),
     ("q", "ddot"): ("ddq", "acceleration"),
+    ("dot", "q"): ("dq", "velocity"),
+    ("dot", "dot", "q"): ("ddq", "acceleration"),
+    ("ddot", "q"): ("ddq", "acceleration"),
     ("i", "q"): ("tau", "current"),
     ("observation", "state"): ("q", "position"),
 }
@@ -118,18 +121,19 @@ def split_unit(name: str) -> Iterator[tuple[str, str]]:
     if opening > 0:
         before, unit = text[:opening], text[opening + 1 : -1].strip()
         # without a blank it may be a joint, as in `position[3]`
-        if before[-1].isspace() or _is_unit(unit):
+        if before[-1].isspace() or is_unit(unit):
             yield before.rstrip(), unit
         return
     for place in [each.start() for each in re.finditer(r"[_ ]", name)][-4:]:
         before, unit = name[:place], name[place + 1 :]
         # a single letter is a unit only if it is unambiguous: in q1_m, but not in q_m
         single = len(normalise_unit(unit)) == 1 and not re.search(r"(?i)(\d\]?|time|stamp|elapsed|\bt)$", before)
-        if before and not unit.rpartition("_")[2].isdecimal() and not single and _is_unit(unit):
+        if before and not unit.rpartition("_")[2].isdecimal() and not single and is_unit(unit):
             yield before, unit
 
 
-def _is_unit(text: str) -> bool:
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit of any quantity."""
     return any(normalise_unit(text) in units for units in UNIT_FACTORS.values())
 
 

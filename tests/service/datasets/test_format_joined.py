@@ -110,3 +110,12 @@ def test_contradictory_tables_and_options_are_rejected(tmp_path, body, kind, opt
 
 def test_dt_adds_times_to_a_file_without_times(tmp_path):
     np.testing.assert_allclose(read(tmp_path, TABLES, "zip", ReadOptions(dt=0.01))["t"], T, atol=1e-15)
+
+
+def test_dot_q_is_a_velocity_and_currents_are_not_torques(tmp_path):
+    body = zipped(**{f"data{name}__txt": text(values) for name, values in (("Q", Q), ("DotQ", DQ), ("Cur", TAU))})
+    names = read(tmp_path, body, "zip").names
+    assert names == (
+        *(f"{name}{joint}" for name in ("q", "dq") for joint in (1, 2, 3)),
+        *(f"dataCur_{j}" for j in (1, 2, 3)),
+    )

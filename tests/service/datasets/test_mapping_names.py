@@ -190,7 +190,7 @@ UNUSABLE = [
     (["q1", "q2", "dq1", "tau1", "tau2"], {}, "column dq2 is missing"),
     (["q2", "tau1", "tau2"], {}, "column q1 is missing"),
     (["q0", "q2", "tau0", "tau1", "tau2"], {}, "column q1 is missing"),
-    (["q9999", "tau1"], {}, "column q1 is missing"),
+    (["q9999", "tau1"], {}, "column tau9999 is missing, expected the torque of q9999"),
     (["q1", "dq1", "dq2", "tau1"], {}, "at most dq1 because there are q1..q1"),
     (["q1", "tau1", "tau1"], {}, "column 3 is tau1, expected each column only once"),
     (["a/position", "b/position", "a/effort"], {}, "drop_joints=b"),

@@ -165,7 +165,7 @@ MISSING = with_column(tau2=without(50, 200), q1=without(0, 1))
 BACK = "expected more than 0.38, the time of the row before"
 LOCKED = "constant at 0.25, expected a joint that moves. Leave out locked joints with drop_joints=joint2"
 DEGREES = 'radians or metres within ±12.6. Set units={"q": "deg"} if these are degrees'
-UNMEASURED = "constant at 0, expected a torque measured while the joint moved. Leave out a joint without one"
+UNMEASURED = "constant at 0, expected a torque measured while the joint moved. Leave out joints without one"
 TOO_FEW = "The file has 29 usable rows, expected at least 30"
 NO_TIME = "199 repeat the time of the row before"
 
@@ -314,3 +314,21 @@ def test_episodes_of_a_real_schunk_are_mapped(tmp_path):
         for quantity in ("q", "dq", "tau"):
             np.testing.assert_array_equal(result.staged.table(quantity), file[quantity])
         np.testing.assert_array_equal(result.staged.read("episode"), file["episode"])
+
+
+def test_remedy_names_all_joints_without_effort(reading):
+    """Wheels and grippers have no effort."""
+    data = motion(n=4)
+    data["tau"][:, [0, 2]] = np.nan
+    with pytest.raises(InvalidDataError) as caught:
+        reading(canonical(data))
+    assert caught.value.detail[0].expected.endswith("drop_joints=joint1,joint3")
+    kept = reading(canonical(data), options(drop_joints=("joint1", "joint3")))
+    assert kept.staged.joint_names == ("joint2", "joint4")
+
+
+def test_one_joint_of_a_robot_is_read(reading):
+    data = {name.replace("1", "3"): values for name, values in canonical(motion(n=1)).items()}
+    result = reading(data)
+    assert result.staged.joint_names == ("joint3",)
+    np.testing.assert_array_equal(result.staged.read("tau1"), data["tau3"])

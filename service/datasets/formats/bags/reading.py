@@ -87,6 +87,8 @@ def read_channel(bag: Bag, channel: Channel, joint_names: tuple[str, ...] | None
         for each in QUANTITIES
     }
     quantities = tuple(each for each in QUANTITIES if holding[each])
+    if "effort" not in quantities:
+        raise _topic_error(channel, "no effort: it is empty in all messages", "the torque of each joint")
     use_stamps, times_of = _choose_clock(survey.stamps[kept], survey.received[kept])
     times = survey.stamps if use_stamps else survey.received
     start = int(times[np.argmax(kept)])
