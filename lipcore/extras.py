@@ -36,8 +36,8 @@ EXTRAS = {
     "robots": Extra("use URDFs", ("pinocchio",)),
     "sim": Extra("simulate robots and know them by name", ("pinocchio",), ROBOTS_DATA),
     "ingest": Extra(
-        "read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra)",
-        ("pyarrow", "clevercsv", "chardet", "dateutil"),
+        "read CSV, Parquet, HDF5, Excel, LeRobot and bags (NPZ and JSON need no extra)",
+        ("pyarrow", "clevercsv", "chardet", "dateutil", "h5py", "openpyxl"),
     ),
     "cluster": Extra("share PostgreSQL, S3 and a Dask cluster", ("psycopg", "s3fs", "distributed")),
     "grpc": Extra("serve over gRPC", ("grpc", "google.protobuf")),

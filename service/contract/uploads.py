@@ -92,7 +92,11 @@ class UploadQuery(BaseModel):
         max_length=MAX_TEXT_CHARS,
         description='Units of columns as JSON, such as `{"q": "deg", "t": "ms"}`; by default as in the header, else SI',
     )
-    topic: str | None = Field(None, max_length=200, description="Topic of a bag, if several can be read")
+    topic: str | None = Field(
+        None,
+        max_length=200,
+        description="Topic of a bag, HDF5 group, or sheet of a workbook, if several can be read",
+    )
     delimiter: str | None = Field(
         None, min_length=1, max_length=1, description="Delimiter of a CSV; detected by default"
     )

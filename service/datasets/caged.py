@@ -25,7 +25,7 @@ def warm() -> None:
         with suppress(ImportError):
             import_module(name)
     import_extra("pyarrow", "ingest")
-    for name in ("csv", "parquet", "bags.reading", "lerobot", "joined"):
+    for name in ("csv", "parquet", "feather", "bags.reading", "lerobot", "joined", "arrays", "workbook"):
         import_extra(f"service.datasets.formats.{name}", "ingest")
     # the first call of an Arrow function takes 50 ms to find it: once here, not in each forked process
     cells = import_module("service.datasets.formats.cells")

@@ -29,7 +29,7 @@ class ReadOptions:
     units: Mapping[str, str] = field(default_factory=dict)
     """Units by the same keys."""
     topic: str | None = None
-    """Topic of a bag."""
+    """Topic of a bag, group of an HDF5 file, or sheet of a workbook."""
     delimiter: str | None = None
     """Delimiter of a CSV."""
     joint_names: tuple[str, ...] | None = None

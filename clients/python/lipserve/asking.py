@@ -31,7 +31,7 @@ class Reading(TypedDict, total=False):
     units: Mapping[str, str]
     """Units of these quantities, e.g. {"q": "deg"}."""
     topic: str
-    """Topic of a bag."""
+    """Topic of a bag, group of an HDF5 file, or sheet of a workbook."""
     delimiter: str
     """Delimiter of a CSV file."""
     column_names: Sequence[str]

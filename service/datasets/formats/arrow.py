@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -9,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from lipcore.data.samples import Array
-from service.datasets.formats.table import SAME_LENGTH
+from service.datasets.formats.table import MAX_COLUMNS, SAME_LENGTH, describe_unread, stack_blocks
 from service.foundation.errors import invalid_data
 
 _INT_MIN = np.iinfo(np.int64).min
@@ -56,6 +58,69 @@ def plan(name: str, kind: pa.DataType, sample: pa.Array, widest: int) -> Node | 
         if child is not None and width * len(child.names) <= widest:
             return _List(name, width, child)
     return None
+
+
+@dataclass(frozen=True)
+class ArrowColumns:
+    """The columns of numbers in tables of one schema.
+
+    nodes: reader of each top-level column; names: of all columns of numbers; units: by name; facts: for the report.
+    """
+
+    nodes: dict[str, Node]
+    names: list[str]
+    units: dict[str, str]
+    facts: list[str]
+
+    @classmethod
+    def plan(
+        cls,
+        schema: pa.Schema,
+        sample: pa.RecordBatch | None,
+        rename: Callable[[str, list[str]], list[str]] | None = None,
+    ) -> ArrowColumns:
+        """Plan the reading of a schema.
+
+        sample: the first rows of nested columns, which show the length of lists; rename: maps the name of a top-level
+        column and the names of its columns to other names.
+        """
+        out, ignored = cls({}, [], {}, []), []
+        for column in schema:
+            first = pa.array(
+                [], column.type.storage_type if isinstance(column.type, pa.BaseExtensionType) else column.type
+            )
+            if sample is not None and is_nested(column.type):
+                first = sample.column(column.name)
+            node = plan(column.name, column.type, first, MAX_COLUMNS)
+            if node is None:
+                ignored.append(column.name)
+                continue
+            names = rename(column.name, node.names) if rename else node.names
+            metadata = column.metadata or {}
+            if unit := metadata.get(b"unit") or metadata.get(b"units"):
+                out.units.update(dict.fromkeys(names, unit.decode("utf-8", "replace")))
+            pairs = zip(node.names, names, strict=True)
+            out.units.update({new: node.units[old] for old, new in pairs if old in node.units})
+            out.nodes[column.name] = node
+            out.names.extend(names)
+        out.facts.extend(describe_unread(ignored, "they hold no numbers, or lists of different lengths"))
+        stamps = [each.name for each in schema if pa.types.is_timestamp(each.type)]
+        out.facts.extend(f"{name} holds dates, which were converted to seconds since the first one" for name in stamps)
+        return out
+
+    def blocks(self, batches: Iterable[pa.RecordBatch]) -> Iterator[Array]:
+        """Yield float64 (rows, columns) of batches of rows; raise InvalidDataError."""
+        row = 1
+        for batch in batches:
+            if batch.num_rows and self.nodes:
+                parts = [node.read(batch.column(name), row) for name, node in self.nodes.items()]
+                yield from stack_blocks([column for columns in parts for column in columns])
+                row += batch.num_rows
+
+
+def is_nested(kind: pa.DataType) -> bool:
+    """Return whether a column holds lists or structures."""
+    return bool(pa.types.is_nested(kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind))
 
 
 class _Number:

@@ -36,6 +36,11 @@ KINDS = {
     "rosbag1": "a ROS 1 bag",
     "rosbag2": "a ROS 2 bag",
     "mcap": "MCAP",
+    "feather": "Feather",
+    "hdf5": "HDF5",
+    "mat": "a MATLAB file",
+    "npy": "a NumPy array",
+    "xlsx": "an Excel workbook",
     "gzip": "a file compressed with gzip",
     "zstd": "a file compressed with zstd",
 }
@@ -44,19 +49,20 @@ PACKED = {"gzip": "gzip", "zstd": "zstd", "single": "zip"}
 """Compression by format, of files that hold another one."""
 SIMILAR_KINDS: tuple[set[str | None], ...] = ({"json", "json_lines"}, {"rosbag1", "rosbag2", "mcap"})
 """Formats that are confused so often that the report does not mention it."""
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _MAGIC = (
     (b"PAR1", "parquet"),
     (b"SQLite format 3\0", "rosbag2"),
     (b"\x89MCAP0\r\n", "mcap"),
     (b"#ROSBAG V2.0\n", "rosbag1"),
+    (b"ARROW1", "feather"),
+    (HDF5_MAGIC, "hdf5"),
+    (b"MATLAB 5.0 MAT-file", "mat"),
+    (b"\x93NUMPY", "npy"),
     *MAGIC,
 )
 _UNSUPPORTED = (
-    (b"\x89HDF\r\n\x1a\n", "HDF5"),
-    (b"MATLAB 5.0 MAT-file", "MATLAB"),
-    (b"ARROW1", "an Arrow file"),
     (b"FEA1", "Feather"),
-    (b"\x93NUMPY", "a single NumPy array"),
     (b"\x80\x03", "a pickle"),
     (b"\x80\x04", "a pickle"),
     (b"\x80\x05", "a pickle"),
@@ -79,6 +85,8 @@ def sniff(path: Path) -> str | None:
     for magic, kind in _MAGIC:
         if head.startswith(magic):
             return kind
+    if head[512:].startswith(HDF5_MAGIC):  # MATLAB 7.3
+        return "hdf5"
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return _sniff_zip(path)
     return _sniff_text(head)
@@ -92,8 +100,7 @@ def name_unsupported(path: Path) -> str | None:
         if head.startswith(magic):
             return kind
     if head.startswith(b"PK"):
-        is_excel = b"[Content_Types].xml" in head
-        return "an Excel workbook" if is_excel else "a zip archive that is damaged or holds other files"
+        return "a zip archive that is damaged or holds other files"
     return None
 
 
@@ -111,6 +118,8 @@ def _sniff_zip(path: Path) -> str | None:
         return "rosbag1"
     if find_tables(names):
         return "joined"
+    if "xl/workbook.xml" in names:
+        return "xlsx"
     if names and all(name.endswith(".npy") for name in names):
         return "npz"
     return "single" if sum(not name.endswith("/") for name in names) == 1 else None
@@ -197,8 +206,8 @@ def _decide_kind(path: Path, kind: str | None) -> str:
     raise invalid_data(
         "file",
         f"{other or 'in an unknown format'}{sent}",
-        "CSV, Parquet, NPZ, JSON, a ROS 1 or ROS 2 bag, MCAP, one of these in gzip, zstd or zip, or a zip of a LeRobot "
-        "data set, a bag or text tables",
+        "CSV, Parquet, Feather, NPZ, JSON, HDF5, MATLAB, Excel, a ROS 1 or ROS 2 bag, MCAP, one of these in gzip, zstd "
+        "or zip, or a zip of a LeRobot data set, a bag or text tables",
     )
 
 
@@ -212,8 +221,9 @@ def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> Ab
     if kind in own:
         return own[kind](path, options, settings)
     import_extra("pyarrow", "ingest")  # the readers below need it
-    if kind in ("csv", "parquet", "lerobot", "joined"):
-        opener: Opener = getattr(import_extra(f"service.datasets.formats.{kind}", "ingest"), f"open_{kind}")
+    module = {"hdf5": "arrays", "mat": "arrays", "npy": "arrays", "xlsx": "workbook"}.get(kind, kind)
+    if kind not in ("rosbag1", "rosbag2", "mcap"):
+        opener: Opener = getattr(import_extra(f"service.datasets.formats.{module}", "ingest"), f"open_{kind}")
         return opener(path, options, settings)
     from service.datasets.formats.bags.reading import BagKind, open_bag  # noqa: PLC0415
 

@@ -15,17 +15,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lipcore.data.samples import Array
-from service.datasets.formats.arrow import Node, plan
-from service.datasets.formats.table import (
-    MAX_COLUMNS,
-    Table,
-    block_rows,
-    clean_names,
-    describe_unread,
-    first_line,
-    stack_blocks,
-    unreadable,
-)
+from service.datasets.formats.arrow import ArrowColumns, is_nested
+from service.datasets.formats.table import Table, block_rows, clean_names, first_line, unreadable
 from service.datasets.options import ReadOptions
 from service.foundation.errors import TooLargeError
 from service.foundation.settings import Settings
@@ -61,7 +52,7 @@ class ParquetSource:
                 raise TooLargeError(f"The file unpacks to {size} bytes, expected at most {settings.max_unpacked_bytes}")
             schema = self._file.schema_arrow
             clean_names(schema.names)
-            nested = [each.name for each in schema if pa.types.is_nested(_storage_type(each.type))]
+            nested = [each.name for each in schema if is_nested(each.type)]
             # the first rows show the length of lists
             batches = self._file.iter_batches(64, columns=nested, use_threads=False) if nested else iter(())
             sample = next(batches, None)
@@ -69,45 +60,14 @@ class ParquetSource:
             text = first_line(error)
             text = "cut off before its end" if "not found in footer" in text else text
             raise unreadable("file", text, EXPECTED) from None
-        self._nodes: dict[str, Node] = {}
-        self.names: list[str] = []
-        self.units: dict[str, str] = {}
-        ignored = []
-        for column in schema:
-            first = pa.array([], _storage_type(column.type))
-            if sample is not None and column.name in nested:
-                first = sample.column(column.name)
-            node = plan(column.name, column.type, first, MAX_COLUMNS)
-            if node is None:
-                ignored.append(column.name)
-                continue
-            self._nodes[column.name] = node
-            names = rename(column.name, node.names) if rename else node.names
-            metadata = column.metadata or {}
-            if unit := metadata.get(b"unit") or metadata.get(b"units"):
-                self.units |= dict.fromkeys(names, unit.decode("utf-8", "replace"))
-            self.units |= {
-                new: node.units[old] for old, new in zip(node.names, names, strict=True) if old in node.units
-            }
-            self.names += names
-        self.facts = describe_unread(ignored, "they hold no numbers, or lists of different lengths")
-        stamps = [each.name for each in schema if pa.types.is_timestamp(each.type)]
-        self.facts += [f"{name} holds dates, which were converted to seconds since the first one" for name in stamps]
+        self.columns = ArrowColumns.plan(schema, sample, rename)
+        self.names, self.units, self.facts = self.columns.names, self.columns.units, self.columns.facts
 
     def blocks(self) -> Iterator[Array]:
         """Yield float64 (rows, columns); raise InvalidDataError."""
-        if not self._nodes:
-            return
-        row, step = 1, block_rows(len(self.names))
+        step, names = block_rows(len(self.names)), list(self.columns.nodes)
         try:
-            for batch in self._file.iter_batches(step, columns=list(self._nodes), use_threads=False):
-                if batch.num_rows:
-                    parts = [node.read(batch.column(name), row) for name, node in self._nodes.items()]
-                    yield from stack_blocks([column for columns in parts for column in columns])
-                    row += batch.num_rows
+            if names:
+                yield from self.columns.blocks(self._file.iter_batches(step, columns=names, use_threads=False))
         except ERRORS as error:
             raise unreadable("file", first_line(error), EXPECTED) from None
-
-
-def _storage_type(kind: pa.DataType) -> pa.DataType:
-    return kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind

@@ -233,7 +233,7 @@ def _end_with_bracket(name: str, start: int, end: int) -> int:
 _TIMES = re.compile(
     r"(?:_*|%|elapsed[_ ]?|log[_ ]?|ros[_ ]?|robot[_ ]?)(?:t|time|times|timestamp|timestamps|stamp)|(?:\w+_)?ts"
 )
-_SPLIT_STAMP = re.compile(r"(.*?)(nsecs?|nanosecs?|nanoseconds|secs?|seconds)")
+_SPLIT_STAMP = re.compile(r"(.*?)(nsecs?|nanosecs?|nanoseconds|nanos|secs?|seconds)")
 
 
 def is_episode(name: str) -> bool:

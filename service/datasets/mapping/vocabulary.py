@@ -56,13 +56,15 @@ _SPELLINGS = (
     (re.compile(r"[\s_/*·⋅.^−-]"), ""),
 )
 QUANTITY_WORDS: dict[str, tuple[str, str]] = {
-    **dict.fromkeys(("q", "pos", "position", "positions"), ("q", "position")),
+    **dict.fromkeys(("q", "qpos", "pos", "position", "positions"), ("q", "position")),
     **dict.fromkeys(("angle", "angles", "theta", "θ"), ("q", "angle")),
     **dict.fromkeys(
-        ("dq", "qd", "qdot", "vel", "vels", "velocity", "velocities", "speed", "speeds", "omega", "ω"),
+        ("dq", "qd", "qdot", "qvel", "vel", "vels", "velocity", "velocities", "speed", "speeds", "omega", "ω"),
         ("dq", "velocity"),
     ),
-    **dict.fromkeys(("ddq", "qdd", "qddot", "acc", "accel", "acceleration", "accelerations"), ("ddq", "acceleration")),
+    **dict.fromkeys(
+        ("ddq", "qdd", "qddot", "qacc", "acc", "accel", "acceleration", "accelerations"), ("ddq", "acceleration")
+    ),
     **dict.fromkeys(("tau", "torque", "torques", "trq", "moment", "moments", "τ"), ("tau", "torque")),
     **dict.fromkeys(("effort", "efforts", "eff"), ("tau", "effort")),
     **dict.fromkeys(("current", "currents", "cur", "iq", "i"), ("tau", "current")),
