@@ -155,13 +155,19 @@ def dataset_of(client: Client, data: str, **reading: Any) -> str:
     if path is None:
         return data
     if not reading and (made := _made_of(client, path)) is not None:
-        note(f"{path.name} is data set {made.id}")
-        return made.id
+        return _noted(path, made)
     adding = f"`lipserve data add {shlex.quote(data)}`"
     hint = f"upload it with {adding}, which has options for reading; then run this command again"
     with advised(hint):
         dataset = upload(client, [path], **reading)
+    return _noted(path, dataset)
+
+
+def _noted(path: Path, dataset: Dataset) -> str:
+    """Print which data set a recording is, and its warnings; return its id."""
     note(f"{path.name} is data set {dataset.id}")
+    for warning in dataset.report.warnings:
+        note(f"warning: {in_shell(warning)}")
     return dataset.id
 
 

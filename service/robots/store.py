@@ -110,7 +110,10 @@ def resolve(database: Database, robot: str, joint_names: Sequence[str], joint_ty
         raise UnknownRobotError(
             f"robot is {robot!r}, expected one of {', '.join(ROBOTS)}, or the id of an uploaded URDF"
         )
-    return RigidBody.from_urdf(row.urdf, joint_names, joint_types, name=row.name)
+    names = profiles.from_urdf(row.urdf, row.name).official_names(joint_names)
+    if names is None or names == tuple(joint_names):
+        return RigidBody.from_urdf(row.urdf, joint_names, joint_types, name=row.name)
+    return replace(RigidBody.from_urdf(row.urdf, joint_names, joint_types, names, row.name), matched="name")
 
 
 def profile_of(database: Database, robot: str) -> Profile:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from lipcore.profiles import Profile
 from lipcore.vocabulary import TorqueConvention
 from service.contract.uploads import Effort
-from service.datasets.mapping.joints import Joint, list_joints
+from service.datasets.mapping.joints import WARNING, Joint, list_joints
 from service.datasets.mapping.recognition import (
     JOINT,
     Family,
@@ -35,8 +35,6 @@ EFFORT_MEANINGS: dict[Effort, str] = {
 }
 
 BY_DEFAULT, BY_NAME = "by default", "by the column names"
-WARNING = "warning: "
-"""Prefix of sentences that belong to the warnings of a report."""
 
 
 @dataclass(frozen=True)

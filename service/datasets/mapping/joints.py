@@ -13,7 +13,10 @@ from service.foundation.errors import InvalidDataError, invalid_data, invalid_re
 from service.foundation.fields import first_repeat
 
 MAX_NAME_CHARS = 100
+WARNING = "warning: "
+"""Prefix of sentences that belong to the warnings of a report."""
 _NUMBER = re.compile(r"\d{1,9}")
+_WORD = re.compile(r"[A-Za-z]+|\d+")
 _MAX_LISTED = 12
 
 
@@ -80,6 +83,12 @@ def arrange_joints(
         left_out += tuple(joint for joint in chosen if joint.index not in {each.index for each in kept})
     if not 1 <= len(kept) <= max_joints:
         raise invalid_data("joints", len(kept), f"1 to {max_joints}")
+    if arms := _find_arms([joint.name for joint in kept]):
+        several = " and ".join(f"{each[0]} to {each[-1]}" for each in arms[:_MAX_LISTED])
+        notes.append(
+            f"{WARNING}By their names, these are the joints of {len(arms)} arms: {several}. Learn each arm alone: "
+            f"joints={','.join(arms[0])}."
+        )
     if robot is None and _is_alphabetical(kept):
         notes.append(
             "the joints are in alphabetical order, as some drivers list them: if this is not from base to tip, set the "
@@ -162,16 +171,19 @@ def _match_robot(
     """Return the chosen joints that the robot has, from base to tip and with its names, their constants, and notes."""
     notes, names = [], robot.joint_names
     constants = None if robot.torque_constants is None else list(robot.torque_constants)
-    places = robot.order_of([joint.name for joint in joints])
+    among = joints if options.joints is None else chosen
+    places = robot.order_of([joint.name for joint in among])
     if places is None and options.read.joint_names is not None:
-        places = robot.order_of([joint.label for joint in joints])
+        places = robot.order_of([joint.label for joint in among])
     if places is None:
+        if len(arms := robot.list_assignments([joint.name for joint in among])) > 1:
+            raise _ambiguous(robot, [[among[each[joint]].name for joint in sorted(each)] for each in arms])
         if len(chosen) != len(names) or not (options.read.joint_names or all(isinstance(j.key, int) for j in chosen)):
             raise _mismatch(robot, chosen)
         ordered = list(chosen)
         notes.append(f"joints are assigned to those of {robot.name} by their order")
     else:
-        ordered = [joints[place] for place in places]
+        ordered = [among[place] for place in places]
     called = {joint.index: place for place, joint in enumerate(ordered)} if len(ordered) == len(names) else {}
     kept = [joint for joint in ordered if joint in chosen]
     others = [joint for joint in chosen if joint not in ordered]
@@ -202,6 +214,29 @@ def _mismatch(robot: Profile, chosen: Sequence[Joint]) -> InvalidDataError:
         f"the joints of {robot.name}: {_listed(robot.joint_names)}. Set `joint_names` to the robot's names in the "
         "order of the file, or leave out other joints with `drop_joints`",
     )
+
+
+def _ambiguous(robot: Profile, arms: Sequence[Sequence[str]]) -> InvalidDataError:
+    several = " and ".join(f"{each[0]} to {each[-1]}" for each in arms[:_MAX_LISTED])
+    expected = f"those of one {robot.name}. Choose one, for example with joints={','.join(arms[0])}"
+    return invalid_data("joints", f"those of several arms: {several}", expected)
+
+
+def _find_arms(names: Sequence[str]) -> list[list[str]]:
+    """Return the joints of each arm if the names differ in one word per arm, such as left and right; else none."""
+    words = [_WORD.findall(name) for name in names]
+    for place in (0, 1, -1):
+        arms: dict[str, dict[tuple[str, ...], str]] = {}
+        for name, each in zip(names, words, strict=True):
+            if len(each) <= max(place, 1) or each[place].isdecimal():
+                break
+            rest = tuple(each[:place] + each[place:][1:])
+            arms.setdefault(each[place], {})[rest] = name
+        else:
+            joints = list(arms.values())
+            if len(joints) > 1 and len(joints[0]) > 2 and all(each.keys() == joints[0].keys() for each in joints):
+                return [list(each.values()) for each in joints]
+    return []
 
 
 def _is_alphabetical(joints: Sequence[Joint]) -> bool:

@@ -16,7 +16,8 @@ from lipcore.vocabulary import TorqueConvention
 from service.datasets.formats.table import Table
 from service.datasets.mapping import checks
 from service.datasets.mapping.checks import ColumnStats, Rows, TimeChecker, TurnUnwrapper
-from service.datasets.mapping.choice import MOTION, WARNING
+from service.datasets.mapping.choice import MOTION
+from service.datasets.mapping.joints import WARNING
 from service.datasets.mapping.mapping import ColumnMap, Source, map_columns
 from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column

@@ -70,5 +70,6 @@ def _missing(n: int, why: str) -> Exception:
     return invalid_data(
         "torque_constants",
         "missing",
-        f"{n} numbers in N·m/A, one per joint: they cannot be estimated, because {why}",
+        f"{n} numbers in N·m/A, one per joint: they cannot be estimated, because {why}. Set effort=measured if it is "
+        "torque",
     )

@@ -14,7 +14,7 @@ from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.contract import datasets as schema
-from service.datasets.mapping.choice import WARNING
+from service.datasets.mapping.joints import WARNING
 from service.datasets.report import texts
 from service.datasets.report.advice import collect_advice, collect_warnings, describe_excitation
 from service.datasets.report.bodies import Bodies, Comparison, Signals, compare

@@ -26,6 +26,7 @@ from service.contract.observations import (
     ObservationResponse,
     State,
 )
+from service.datasets.mapping import checks
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import check_shapes, check_times
@@ -38,6 +39,8 @@ from service.storage.database import EventRow, StreamRow
 
 MAX_ROWS = 5000
 """Max rows of one observation batch."""
+TIME_UNITS = {"ms": 1e3, "µs": 1e6, "ns": 1e9}
+"""Units of time that batches may have by mistake, and how many make a second."""
 REUSE_HINT = "use another stream_id for a new run, or higher sequences"
 """Advice at the end of an error message."""
 
@@ -153,7 +156,22 @@ def validate_batch(request: ObservationRequest, model: TorqueModel) -> MeasuredR
         raise invalid_request("ddq", "missing", "accelerations, or times `t` to derive them", message)
     order = slice(None) if request.joint_names is None else find_columns(request.joint_names, model.joint_names)
     q, dq, tau = (_ordered(values, order) for values in (request.q, request.dq, request.tau))
+    if request.t is not None:
+        _check_time_unit(request.t, q, dq)
     return MeasuredRows(request.t, q, dq, None if request.ddq is None else _ordered(request.ddq, order), tau)
+
+
+def _check_time_unit(t: Array, q: Array, dq: Array) -> None:
+    """Raise InvalidRequestError if positions change with the velocities as if times were not in s."""
+    if not all(np.isfinite(values).all() for values in (t, q, dq)):
+        return
+    ratios = [checks.slope_ratio(t, q[:, joint], dq[:, joint]) for joint in range(q.shape[1])]
+    known = [ratio for ratio in ratios if ratio is not None]
+    for unit, factor in TIME_UNITS.items():
+        if known and abs(float(np.median(known)) / factor - 1) < checks.CHECKS.unit_tolerance:
+            step = f"in steps of {np.median(np.diff(t)):g}"
+            expected = f"times in s: q changes by dq as if these were {unit}. Multiply them by {1 / factor:g}"
+            raise invalid_request("t", step, expected)
 
 
 def _ordered(values: Array, order: slice | list[int]) -> Array:

@@ -4,6 +4,7 @@ import json
 import threading
 from contextlib import nullcontext
 
+import numpy as np
 import pytest
 
 from lipserve import ApiError, Client, ServiceUnreachableError
@@ -316,3 +317,13 @@ def test_training_is_followed_over_a_restart(lipserve, tmp_path, recording):
     with first, second:
         assert (code, f"{job} is queued" in err, "cli-over version 1 trained" in out) == (0, True, True), err
         assert second.client.get(f"/v1/jobs/{job}").json()["attempts"] == 2
+
+
+def test_train_prints_the_warnings_of_the_recording(run_command, run_on_server, tmp_path):
+    motion = stream(seed=17, samples=120, rate=10.0)
+    motion.tau[10:30, 0] = np.nan
+    path = tmp_path / "gaps.csv"
+    path.write_bytes(csv(columns(motion)))
+    warning = "20 of 120 rows lack a value and were dropped"
+    assert warning in run_command("data", "add", path)
+    assert warning in run_on_server("train", path, "--model", "of-gaps", *QUICKLY)[2]

@@ -321,3 +321,26 @@ def test_any_columns_are_mapped_or_rejected(names, columns, effort, dropped, joi
     assert len({each.index for each in sources}) == len(sources)
     assert all(names[each.index] == each.name for each in [*sources, *result.t])
     assert len(set(result.joints)) == len(result.joints)
+
+
+ARMS = {"left_#": "right_#", "#_left": "#_right", "bi_left_#": "bi_right_#"}
+
+
+@pytest.mark.parametrize(("left", "right"), ARMS.items())
+def test_two_arms_are_told_apart_and_learnt_alone(left, right):
+    joints = profile("ur5e").joint_names
+    first, second = ([pattern.replace("#", joint) for joint in joints] for pattern in (left, right))
+    names = [f"{joint}/{kind}" for joint in (*first, *second) for kind in ("position", "velocity", "effort")]
+    warned = [note for note in mapped(["t", *names]).notes if "2 arms" in note]
+    assert warned[0].endswith(f"joints={','.join(first)}.")
+    if left.endswith("#"):
+        with pytest.raises(InvalidDataError, match="several arms") as caught:
+            mapped(["t", *names], options(effort="measured"), profile("ur5e"))
+        chosen = caught.value.detail[0].expected.partition("joints=")[2].split(",")
+        assert mapped(["t", *names], options(joints=chosen, effort="measured"), profile("ur5e")).joints == joints
+
+
+@pytest.mark.parametrize("names", [("a", "b", "c"), ("joint1", "joint2", "joint3"), ("left_a", "right_b", "left_c")])
+def test_one_arm_is_no_two(names):
+    columns = [f"{joint}/{kind}" for joint in names for kind in ("position", "effort")]
+    assert not any("arms" in note for note in mapped(["t", *columns]).notes)

@@ -72,6 +72,15 @@ def test_malformed_batches_are_rejected_with_the_field(empty_model, body, change
     assert item | expected == item
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("µs", 1e6), ("ns", 1e9)])
+def test_times_in_another_unit_are_named(empty_model, unit, factor):
+    rows = slice_recording(make_recording(), 0, 60)
+    t = (factor * np.asarray(rows["t"])).tolist()
+    (item,) = expect_rejection(empty_model, make_request(0, rows | {"t": t}))["detail"]
+    assert item["field"] == "t"
+    assert f"as if these were {unit}. Multiply them by {1 / factor:g}" in item["expected"]
+
+
 def test_rows_of_paused_model_are_logged_and_can_be_replayed(learning_model, body):
     before = learning_model.wait_for_revision(0)
     learning_model.put("learning", {"enabled": False})

@@ -234,3 +234,10 @@ def test_command_line_and_client_manage_robots(server, lipserve, tmp_path):  # n
         assert client.version("by-cli", 1).robot["name"] == "2dof_planar"
         with pytest.raises(ApiError, match="not well-formed"):
             client.upload_robot(text)
+
+
+@pytest.mark.parametrize("names", [("ns/joint1", "ns/joint2"), ("arm_joint1", "arm_joint2")])
+def test_joints_are_matched_despite_a_prefix(api, names):
+    robot = add_robot(api, urdf(joints=names))["id"]
+    body = store.resolve(service_of(api).storage.database, robot, ("joint1", "joint2"), ("revolute", "revolute"))
+    assert (body.joint_names, body.urdf_joints, body.matched) == (("joint1", "joint2"), names, "name")
