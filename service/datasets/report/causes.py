@@ -39,6 +39,8 @@ class CauseOptions:
 
     zero: float = 0.35
     """Size below which a factor counts as 0."""
+    visible: float = 0.05
+    """Share of a torque's standard deviation above which gravity would show, even in narrow motion."""
     scale: float = 2.0
     """Ratio above which torques that are all too large, or all too small, are not torques of the robot in N·m."""
     double: tuple[float, float] = (1.6, 2.5)
@@ -216,17 +218,17 @@ class _Case:
                 return None
             names, options = self._names(heavy), {"torque_convention": "gravity_included"}
             return make_remedy("gravity_included", names, texts.unexpected_gravity(names, g[heavy], robot), options)
-        visible = np.flatnonzero(comparison.visible_gravity).tolist()
-        expected = [j for j in visible if comparison.gravity_std[j] < CAUSE.zero]
+        known = (comparison.visible[:, 0] > CAUSE.visible) & (comparison.gravity_std < CAUSE.zero)
+        expected = np.flatnonzero(known).tolist()
         absent = [j for j in expected if self._lacks_gravity(j)]
         # if inertia is too small as well, all of the torque may be too small
         missing = inertia is not None and inertia > 1 / CAUSE.scale
         missing = missing and bool(absent) and len(absent) >= CAUSE.min_absent * len(expected)
         missing = missing and float(np.abs(g[expected]).max()) < 1 / CAUSE.scale
         upwards = bool(heavy) and bool((g[heavy] < 0).all())
-        if visible and (comparison.explained[visible] < CAUSE.explained).any() and self._is_tilted(visible):
-            names = self._names(visible)
-            return make_remedy("mounting", names, texts.tilted_gravity(names, robot))
+        if (comparison.explained < CAUSE.explained).any() and (tilt := self._find_tilt()) is not None:
+            names = self._names(tilt[0])
+            return make_remedy("mounting", names, texts.tilted_gravity(names, robot, tilt[1]))
         names = self._names(heavy)
         if upwards:
             return make_remedy("mounting", names, texts.upward_gravity(names, g[heavy], robot))
@@ -276,24 +278,28 @@ class _Case:
         upper = size + CAUSE.stds * self.comparison.gravity_std[joint]
         return bool(upper < CAUSE.zero and size * self.comparison.visible[joint, 0] < BODIES.visible)
 
-    def _is_tilted(self, joints: Sequence[int]) -> bool:
-        """Return whether gravity in one other direction explains the torque of these joints far better."""
+    def _find_tilt(self) -> tuple[list[int], float] | None:
+        """Return the joints that show gravity in another direction, and the angle to it in degrees; None if none do.
+
+        One direction is fitted to all joints: each torque, without its own inertia and friction, as a combination of
+        those by gravity downwards and along two horizontal axes.
+        """
         gravity, rest = self.bodies.parts(self.signals)
-        sides = self.bodies.horizontal_gravity(self.signals.q)
-        gains, directions = [], []
-        axes = [0, -2, -1]  # columns of gravity downwards and along two horizontal axes
-        for j in joints:
-            columns = design_matrix(gravity[:, j], rest[:, j], self.signals.dq[:, j])
-            both = np.column_stack([columns, sides[0][:, j], sides[1][:, j]])
-            upright, tilted = (BlockFit.of(x, self.signals.tau[:, j, None]) for x in (columns, both))
-            gains.append(float(np.log(upright.errors.mean()) - np.log(tilted.errors.mean())))
-            if (tilted.std[axes] < CAUSE.zero).all():
-                directions.append(tilted.weights[axes, 0])
-        if len(directions) < 2 or np.mean(gains) < np.log(CAUSE.min_gain):
-            return False
-        middle = np.median(directions, axis=0)
-        off = np.median(np.abs(directions - middle).max(axis=1))
-        return bool(MATCH.one[0] < np.linalg.norm(middle) < MATCH.one[1] and off < CAUSE.zero)
+        sides = np.stack([gravity, *self.bodies.horizontal_gravity(self.signals.q)], axis=-1)
+        torque, own = np.empty_like(self.signals.tau), np.empty_like(sides)
+        for j in range(self.upload.n_joints):
+            basis = np.linalg.qr(design_matrix(gravity[:, j], rest[:, j], self.signals.dq[:, j])[:, 1:])[0]
+            spread = max(float(self.signals.tau[:, j].std()), 1e-12)
+            for parts, out in ((self.signals.tau[:, j, None], torque[:, j, None]), (sides[:, j], own[:, j])):
+                out[:] = (parts - basis @ (basis.T @ parts)) / spread
+        rows, values = own.reshape(-1, 3), torque.reshape(-1, 1)
+        upright, tilted = (BlockFit.of(rows[:, :count], values) for count in (1, 3))
+        gain, found = upright.errors.mean() / tilted.errors.mean(), tilted.weights[:, 0]
+        size = float(np.linalg.norm(found))
+        if gain < CAUSE.min_gain or not MATCH.one[0] < size < MATCH.one[1] or (tilted.std > CAUSE.zero).any():
+            return None
+        joints = np.flatnonzero((own @ found).std(axis=0) > BODIES.visible)
+        return joints.tolist(), float(np.degrees(np.arccos(np.clip(found[0] / size, -1.0, 1.0))))
 
     def _names(self, joints: Sequence[int]) -> list[str]:
         return [self.upload.names[j] for j in joints]

@@ -161,11 +161,11 @@ def upward_gravity(joints: Sequence[str], factors: Iterable[float], robot: str) 
     )
 
 
-def tilted_gravity(joints: Sequence[str], robot: str) -> str:
-    """Report gravity in another direction than the URDF's. joints: those with visible gravity."""
+def tilted_gravity(joints: Sequence[str], robot: str, angle: float) -> str:
+    """Report gravity in another direction than the URDF's. joints: those with visible gravity; angle: degrees."""
     return (
-        f"The torque of {list_names(joints)} has gravity in another direction than the base of {robot}. "
-        f"Is the robot on a wall, or tilted? {_MOUNTING}"
+        f"The torque of {list_names(joints)} has gravity in another direction than the base of {robot}, about "
+        f"{angle:.0f}° away. Is the robot on a wall, or tilted? {_MOUNTING}"
     )
 
 
