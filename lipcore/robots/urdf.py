@@ -13,6 +13,7 @@ from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Array
 from lipcore.robots.library import ROBOTS, UnknownRobotError, pinocchio, profile_urdf
 from lipcore.robots.urdf_text import MOVABLE, UrdfError, UrdfJoint, read_urdf
+from lipcore.robots.urdf_units import check_bodies
 from lipcore.vocabulary import JointType
 
 Matching = Literal["name", "order", "list"]
@@ -153,33 +154,8 @@ def describe(urdf: str) -> Description:
     joints = tuple(joint for joint in text.joints if joint.kind in MOVABLE and joint.mimics is None)
     if not joints:
         raise UrdfError("the URDF has no joint that moves, expected revolute, continuous or prismatic joints")
-    _check_bodies(_parse(text.plain))
+    check_bodies(text.plain, _parse)
     return Description(text.robot, joints)
-
-
-def _check_bodies(model: Any) -> None:
-    """Raise UrdfError if no body of its mass and size can have an inertia; zero inertia counts as missing.
-
-    Principal moments I₁ ≤ I₂ ≤ I₃ about the centre of mass satisfy I₃ ≤ I₁ + I₂, with 5 % for rounding. The radius of
-    gyration √(I₃/m) is within the robot's reach. No matter is denser than 25 000 kg/m³, more than osmium: of all bodies
-    of one mass and density a ball has the smallest I₁ + I₂ + I₃ = 6/5 m r².
-    """
-    reach = max(1.0, sum(float(np.linalg.norm(place.translation)) for place in tuple(model.jointPlacements)))
-    for name, inertia in tuple(zip(tuple(model.names), tuple(model.inertias), strict=True))[1:]:  # the base is first
-        mass, moments = float(inertia.mass), np.linalg.eigvalsh(inertia.inertia)
-        if mass <= 0 or moments[2] <= mass * 1e-6**2:
-            continue
-        body, about = f"the body that joint {name!r} moves has", "expected kg·m² about its centre of mass"
-        radius, ball = float(np.sqrt(moments[2] / mass)), float(np.sqrt(5 / 6 * moments.sum() / mass))
-        if moments[2] > 1.05 * (moments[0] + moments[1]):
-            listed = ", ".join(f"{each:.3g}" for each in moments)
-            raise UrdfError(f"{body} principal moments of inertia {listed}, expected none above the sum of the others")
-        if radius > reach:
-            raise UrdfError(f"{body} a radius of gyration of {radius:.3g} m for a robot of {reach:.3g} m, {about}")
-        if mass / (4 / 3 * np.pi * ball**3) > 25_000.0:
-            raise UrdfError(
-                f"{body} {mass:.3g} kg within {1e3 * ball:.2g} mm, denser than any metal; {about}, mass in kg"
-            )
 
 
 def _mismatch(robot: str, movable: Sequence[str], data: Sequence[str], listed: str = "") -> JointMismatchError:

@@ -13,7 +13,7 @@ from rich.table import Table
 from lipserve.address import DEFAULT_URL
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, out, print_json, print_result
-from service.cli.options import Json, Limit, Url, Yes, confirm, group
+from service.cli.options import Json, Limit, Url, Yes, confirm, group, pairs
 from service.foundation.text import counted
 
 app = group("List and show robots; add and delete URDFs.")
@@ -59,14 +59,19 @@ def show(robot: Robot, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
 @app.command()
 def add(
     path: Annotated[Path, typer.Argument(help="A .urdf file.", exists=True, dir_okay=False)],
+    scale: Annotated[
+        list[str] | None,
+        typer.Option(help="Factor to m, kg or kg·m²: length=0.001 for mm, inertia=1e-9 for g·mm². Repeatable."),
+    ] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
     """Upload a URDF for use with recordings and training."""
     if path.suffix != ".urdf":
         raise CommandError(f"{str(path)!r} is not a .urdf file")
+    factors = pairs("--scale", [part for each in scale or () for part in each.split(",")])
     with connected(url) as client:
-        robot = client.upload_robot(path)
+        robot = client.upload_robot(path, scale={name: float(text) for name, text in factors.items()} or None)
     print_result(robot, as_json, f"{path.name} uploaded as {robot.id}: `lipserve train … --robot {robot.id}`")
 
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import cast
+
 from lipcore.profiles.profile import read_limits
+from lipcore.robots import urdf_text, urdf_units
 from lipcore.robots.library import pinocchio
 from lipcore.robots.urdf import Description, describe
 from lipcore.robots.urdf_text import UrdfError
+from lipcore.robots.urdf_units import Scale
 from service.foundation.errors import InvalidDataError, problem
 
 
@@ -14,14 +19,25 @@ def warm() -> None:
     pinocchio()
 
 
-def read_urdf(urdf: str) -> Description:
-    """Return the description of a URDF; raise InvalidDataError naming the error in it."""
+@dataclass(frozen=True)
+class ReadUrdf:
+    """A URDF in SI units, and its description."""
+
+    urdf: str
+    description: Description
+
+
+def read_urdf(urdf: str, scale: dict[str, float]) -> ReadUrdf:
+    """Return a URDF in SI units. scale: factors of its quantities. Raise InvalidDataError naming the error in it."""
     try:
+        if scale:
+            urdf_text.read_urdf(urdf)
+            urdf = urdf_units.scaled(urdf, cast(Scale, scale))
         described = describe(urdf)
         read_limits(urdf, described.joint_names)
     except UrdfError as error:
         raise invalid_urdf(str(error)) from None
-    return described
+    return ReadUrdf(urdf, described)
 
 
 def invalid_urdf(message: str) -> InvalidDataError:

@@ -13,9 +13,9 @@ from sqlalchemy.orm import undefer
 from lipcore import profiles
 from lipcore.data.motion import Array
 from lipcore.profiles import Profile
-from lipcore.profiles.names import is_number
+from lipcore.profiles.names import is_number, split_words
 from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
-from lipcore.robots.urdf import Description, RigidBody
+from lipcore.robots.urdf import RigidBody
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from service.contract.robots import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.contract.states import ACTIVE
@@ -27,20 +27,25 @@ from service.foundation.errors import (
 )
 from service.foundation.fields import MAX_NAME_CHARS, check_name
 from service.foundation.settings import Settings
-from service.robots.caged import invalid_urdf
+from service.robots.caged import ReadUrdf, invalid_urdf
 from service.runtime import cage
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
 from service.storage.rows import Page, read_page
 
 
-def add(database: Database, content: bytes, name: str | None, settings: Settings) -> Robot:
-    """Check a URDF and store it; raise InvalidDataError naming the error in it."""
+def add(database: Database, content: bytes, name: str | None, scale: str | None, settings: Settings) -> Robot:
+    """Check a URDF and store it in SI units; raise InvalidDataError naming the error in it.
+
+    scale: factors of its quantities, such as `length=0.001,inertia=1e-9`; raise InvalidRequestError for another text.
+    """
     try:
         urdf = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise invalid_urdf(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
-    described = cage.run("service.robots.caged:read_urdf", Description, urdf, settings=settings, field="urdf")
+    function, factors = "service.robots.caged:read_urdf", _factors(scale)
+    read = cage.run(function, ReadUrdf, urdf, factors, settings=settings, field="urdf")
+    urdf, described = read.urdf, read.description
     row = RobotRow(
         id=new_id("urdf"),
         name=name or check_name("robot name", described.name[:MAX_NAME_CHARS] or "unnamed"),
@@ -52,6 +57,20 @@ def add(database: Database, content: bytes, name: str | None, settings: Settings
     with database.transaction() as session:
         session.add(row)
     return _show(row)
+
+
+def _factors(scale: str | None) -> dict[str, float]:
+    """Return the factors of a text such as `length=0.001,inertia=1e-9`."""
+    out: dict[str, float] = {}
+    for part in [] if scale is None else scale.split(","):
+        quantity, _, factor = part.partition("=")
+        try:
+            out[quantity.strip()] = float(factor)
+        except ValueError:
+            raise invalid_request(
+                "scale", scale, "factors to m, kg and kg·m², such as length=0.001,mass=0.001"
+            ) from None
+    return out
 
 
 def show(database: Database, robot: str) -> Robot:
@@ -111,7 +130,10 @@ def resolve(database: Database, robot: str, joint_names: Sequence[str], joint_ty
             f"robot is {robot!r}, expected one of {', '.join(ROBOTS)}, or the id of an uploaded URDF"
         )
     names = profiles.from_urdf(row.urdf, row.name).official_names(joint_names)
-    if names is None or names == tuple(joint_names):
+    alike = names is not None and all(
+        split_words(own)[-1:] == split_words(given)[-1:] for own, given in zip(names, joint_names, strict=True)
+    )
+    if not alike or names == tuple(joint_names):
         return RigidBody.from_urdf(row.urdf, joint_names, joint_types, name=row.name)
     return replace(RigidBody.from_urdf(row.urdf, joint_names, joint_types, names, row.name), matched="name")
 

@@ -43,6 +43,10 @@ async def upload(
     response: Response,
     storage: StorageDep,
     name: Annotated[NameForPeople | None, Query(description="Display name. Default: the name in the URDF")] = None,
+    scale: Annotated[
+        str | None,
+        Query(max_length=100, description="Factors to SI units: `length=0.001,inertia=1e-9` for mm and g·mm²"),
+    ] = None,
 ) -> Robot:
     """Check a URDF and store it as a robot. Files that it refers to, such as meshes, are not opened.
 
@@ -51,7 +55,7 @@ async def upload(
     kinds = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
     _, content = await receive(request, kinds)
     await to_thread.run_sync(storage.disk.reserve, len(content))
-    robot = await to_thread.run_sync(store.add, storage.database, content, name, storage.settings)
+    robot = await to_thread.run_sync(store.add, storage.database, content, name, scale, storage.settings)
     response.headers["Location"] = f"/v1/robots/{robot.id}"
     return robot
 

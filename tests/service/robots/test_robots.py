@@ -8,6 +8,8 @@ from sqlalchemy import update
 
 import lipcore
 from lipcore.robots.library import ROBOTS, load_robot, profile_urdf
+from lipcore.robots.urdf import RigidBody
+from lipcore.robots.urdf_units import SYSTEMS, UNITS, scaled
 from lipserve import ApiError, Client
 from service.foundation.errors import InvalidRequestError
 from service.models import registry
@@ -241,3 +243,24 @@ def test_joints_are_matched_despite_a_prefix(api, names):
     robot = add_robot(api, urdf(joints=names))["id"]
     body = store.resolve(service_of(api).storage.database, robot, ("joint1", "joint2"), ("revolute", "revolute"))
     assert (body.joint_names, body.urdf_joints, body.matched) == (("joint1", "joint2"), names, "name")
+
+
+@pytest.mark.parametrize("system", [each for each in SYSTEMS if "lb" not in each])
+@pytest.mark.parametrize("arm", ["panda", "kinova", "ur10"])
+def test_units_of_a_urdf_are_named_and_scaled(api, arm, system):
+    factors = {name: UNITS[unit] for name, unit in zip(("length", "mass", "inertia"), system, strict=True)}
+    exported = scaled(profile_urdf(arm), {name: 1 / factor for name, factor in factors.items()})
+    reply = error(post_robot(api, exported.encode()), 422, "invalid_data")
+    scale = reply["message"].partition("set scale=")[2]
+    assert scale == ",".join(f"{name}={factor:g}" for name, factor in factors.items() if factor != 1)
+    made = add_robot(api, exported.encode(), scale=scale)
+    names, types = load_robot(arm).joint_names, load_robot(arm).joint_types
+    found = store.resolve(service_of(api).storage.database, made["id"], names, types)
+    expected = RigidBody.from_urdf(profile_urdf(arm), names, types)
+    np.testing.assert_allclose(found.parameters(), expected.parameters(), rtol=1e-9, atol=1e-12)
+    assert found.length() == pytest.approx(expected.length())
+
+
+@pytest.mark.parametrize("scale", ["length", "length=x", "width=0.1", "mass=0", "mass=nan"])
+def test_wrong_scale_is_rejected(api, scale):
+    assert post_robot(api, urdf(), scale=scale).status_code == 422

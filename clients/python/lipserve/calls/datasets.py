@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Unpack
 
@@ -96,10 +96,19 @@ def delete_dataset(_route: Route, dataset: str) -> Call[None]:
 
 
 @route("POST", "/v1/robots")
-def upload_robot(_route: Route, path: Path | str, name: str | None = None) -> Call[Robot]:
-    """Upload a URDF. name: name of the robot."""
+def upload_robot(
+    _route: Route, path: Path | str, name: str | None = None, scale: Mapping[str, float] | None = None
+) -> Call[Robot]:
+    """Upload a URDF.
+
+    Args:
+        path: The file.
+        name: Name of the robot.
+        scale: Factors of `length`, `mass` and `inertia` to m, kg and kg·m², for a URDF in other units.
+    """
     headers = {"content-type": "application/xml"}
-    return _route(record(Robot), names={}, params=given(name=name), headers=headers, file=Path(path))
+    factors = None if scale is None else ",".join(f"{quantity}={factor:g}" for quantity, factor in scale.items())
+    return _route(record(Robot), names={}, params=given(name=name, scale=factors), headers=headers, file=Path(path))
 
 
 @route("GET", "/v1/robots")
