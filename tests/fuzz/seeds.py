@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import io
 import json
@@ -14,8 +15,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+import openpyxl
 import pyarrow as pa
+import scipy.io
+from pyarrow import feather
 
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, TENSORS
@@ -47,6 +52,7 @@ def seeds() -> Iterator[tuple[str, bytes]]:
     yield "csv", text.replace(",", ";").replace(".", ",").encode()
     yield "csv", ("# " + text.replace(",", " \t")).encode()
     yield "csv", _dated(table).encode()
+    yield from _layouts(text)
     yield "json", json.dumps(rows).encode()
     yield "json", json.dumps({name: values.tolist() for name, values in COLUMNS.items()}).encode()
     yield "json", json.dumps({"columns": list(COLUMNS), "data": [list(row.values()) for row in rows]}).encode()
@@ -75,6 +81,42 @@ def seeds() -> Iterator[tuple[str, bytes]]:
     yield "zip", _lerobot()
     yield "urdf", URDF.format(LINK.format("base", 1) + LINK.format("l1", 2)).encode()
     yield from _models()
+
+
+def _layouts(text: str) -> Iterator[tuple[str, bytes]]:
+    """Yield tables of text in other layouts, and files of arrays."""
+    names, *lines = text.splitlines()
+    units = ",".join("s" if name == "t" else "rad" if name.startswith("q") else "Nm" for name in COLUMNS)
+    yield "csv", f"Recorder;1.0\n\n{names}\n{units}\n{chr(10).join(lines)}".encode("utf-16")
+    cells = [line.split(",") for line in text.splitlines()]
+    yield "csv", "\n".join(",".join(row) for row in zip(*cells, strict=True)).encode()
+    joints = (
+        f"{t:.2f},{name},{q:.4f},{2 * q:.4f}"
+        for t, row in zip(T, ARRAYS["q"], strict=True)
+        for name, q in zip("ab", row, strict=True)
+    )
+    yield "csv", "\n".join(["time,joint,position,effort", *joints]).encode()
+    lists = (f'{t:.2f},"{list(q)}","[a, b]"' for t, q in zip(T, ARRAYS["q"].round(4).tolist(), strict=True))
+    yield "csv", "\n".join(["time,position,names", *lists]).encode()
+    yield "gzip", gzip.compress(text.encode(), mtime=0)
+    few = {"t": T, "q": ARRAYS["q"], "tau": ARRAYS["tau"]}
+
+    def write_hdf5(file: Any, **options: Any) -> None:
+        with h5py.File(file, "w") as root:
+            for name, values in few.items():
+                root.create_dataset(f"demo_1/{name}", data=values, **options)
+
+    yield "hdf5", _written(write_hdf5)
+    yield "hdf5", _written(lambda file: write_hdf5(file, chunks=True, compression="gzip", shuffle=True))
+    yield "mat", _written(lambda file: scipy.io.savemat(file, few))
+    yield "mat", _written(lambda file: scipy.io.savemat(file, {"log": few}, do_compression=True))
+    record = np.rec.fromarrays(list(COLUMNS.values()), names=list(COLUMNS))
+    yield "npy", _written(lambda file: np.save(file, record))
+    yield "feather", _written(lambda file: feather.write_feather(pa.table(COLUMNS), file, compression="uncompressed"))
+    book = openpyxl.Workbook()
+    for row in cells[:12]:
+        book.active.append([float(cell) if cell[-1:].isdigit() and cell[0] in "-0123456789" else cell for cell in row])
+    yield "xlsx", _written(book.save)
 
 
 def _models() -> Iterator[tuple[str, bytes]]:

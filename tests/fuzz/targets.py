@@ -34,7 +34,7 @@ SMALL = {
     "formats.table.MAX_COLUMNS": 200,
     "formats.json.MAX_COLUMNS": 200,
     "formats.npz.MAX_COLUMNS": 200,
-    "formats.parquet.MAX_COLUMNS": 200,
+    **{f"formats.{name}.MAX_COLUMNS": 200 for name in ("arrow", "arrays", "csv", "transposed", "workbook")},
     "formats.zips.MAX_MEMBERS": 50,
     "formats.bags.container.MAX_PART_BYTES": 4 * MiB,
     "formats.bags.files.MAX_PART_BYTES": 4 * MiB,
@@ -75,7 +75,8 @@ def _recording(kind: str) -> Callable[[bytes], None]:
 
 def _urdf(data: bytes) -> None:
     text = data.decode("utf-8-sig", "replace")
-    read_urdf(text)
+    read_urdf(text, {})
+    read_urdf(text, {"length": 0.5, "mass": 2.0, "inertia": 0.1})
     from_urdf(text, "fuzzed")  # a URDF that can be read can also be used
 
 
@@ -91,6 +92,7 @@ def _tensors(data: bytes) -> None:
 
 
 KINDS = ("csv", "json", "json_lines", "npz", "parquet", "rosbag1", "rosbag2", "mcap", "zip")
+KINDS += ("feather", "hdf5", "mat", "npy", "xlsx", "gzip")
 TARGETS: dict[str, Callable[[bytes], object]] = {
     **{kind: _recording(kind) for kind in KINDS},
     "urdf": _urdf,
