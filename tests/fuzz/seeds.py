@@ -19,7 +19,6 @@ import h5py
 import numpy as np
 import openpyxl
 import pyarrow as pa
-import scipy.io
 from pyarrow import feather
 
 from lipcore.files import persistence
@@ -108,8 +107,6 @@ def _layouts(text: str) -> Iterator[tuple[str, bytes]]:
 
     yield "hdf5", _written(write_hdf5)
     yield "hdf5", _written(lambda file: write_hdf5(file, chunks=True, compression="gzip", shuffle=True))
-    yield "mat", _written(lambda file: scipy.io.savemat(file, few))
-    yield "mat", _written(lambda file: scipy.io.savemat(file, {"log": few}, do_compression=True))
     record = np.rec.fromarrays(list(COLUMNS.values()), names=list(COLUMNS))
     yield "npy", _written(lambda file: np.save(file, record))
     yield "feather", _written(lambda file: feather.write_feather(pa.table(COLUMNS), file, compression="uncompressed"))

@@ -34,6 +34,7 @@ from service.foundation.text import counted
 
 MAX_ARRAYS = 20_000
 KNOWN = ("q", "dq", "ddq", "tau")
+COMPLETE = "a complete HDF5 file"
 STEPS = ("dt", "sample_time", "Ts")
 """Names of a number that is the time between samples, s."""
 _NUMBER = re.compile(r"\d+")
@@ -69,33 +70,35 @@ def open_hdf5(path: Path, options: ReadOptions, settings: Settings) -> Iterator[
 
     Raise InvalidDataError or TooLargeError.
     """
-    with _hdf5(path) as file:
-        arrays: dict[str, Any] = {}
-
-        def add(name: str, found: Any) -> None:
-            if isinstance(found, h5py.Dataset) and not name.startswith("#"):  # MATLAB's own
-                if len(arrays) >= MAX_ARRAYS:
-                    raise TooLargeError(f"The file has more than {MAX_ARRAYS} arrays")
-                if found.is_virtual or found.external:
-                    raise invalid_data(name, "stored in another file", "an array that this file contains")
-                arrays[name] = found
-
-        try:
-            file.visititems(add)
-            size = sum(each.size * each.dtype.itemsize for each in arrays.values() if each.dtype.kind in "fiub")
-            yield _table(arrays, options, settings, size if options.topic is None else 0)
-        except (OSError, RuntimeError, KeyError) as error:
-            raise unreadable("file", first_line(error), "a complete HDF5 file") from None
-
-
-@contextmanager
-def _hdf5(path: Path) -> Iterator[Any]:
     try:
         file = h5py.File(path, "r", locking=False)
-    except OSError as error:
-        raise unreadable("file", first_line(error), "a complete HDF5 file") from None
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise unreadable("file", first_line(error), COMPLETE) from None
     with file:
-        yield file
+        arrays = _datasets(file)
+        size = sum(each.size * each.dtype.itemsize for each in arrays.values()) if options.topic is None else 0
+        yield _table(arrays, options, settings, size)
+
+
+def _datasets(file: Any) -> dict[str, Any]:
+    """Return the data sets of numbers and texts in an HDF5 file; raise InvalidDataError or TooLargeError."""
+    arrays: dict[str, Any] = {}
+
+    def add(name: str, found: Any) -> None:
+        if not isinstance(found, h5py.Dataset) or name.startswith("#"):  # MATLAB's own
+            return
+        if len(arrays) >= MAX_ARRAYS:
+            raise TooLargeError(f"The file has more than {MAX_ARRAYS} arrays")
+        if found.is_virtual or found.external:
+            raise invalid_data(name, "stored in another file", "an array that this file contains")
+        if found.dtype.kind in "fiub":
+            arrays[name] = found
+
+    try:
+        file.visititems(add)
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # h5py's, for damaged files
+        raise unreadable("file", first_line(error), COMPLETE) from None
+    return arrays
 
 
 @contextmanager
@@ -218,4 +221,8 @@ def _blocks(
         for begin in range(0, part.rows, block_rows(width)):
             end = min(begin + block_rows(width), part.rows)
             own = {"episode": np.full(end - begin, float(number)), "t": np.arange(begin, end) * (step or 0.0)}
-            yield np.column_stack([*(own[name] for name in extra), *(part.read(name, begin, end) for name in used)])
+            try:
+                read = [part.read(name, begin, end) for name in used]
+            except (OSError, RuntimeError, ValueError, TypeError) as error:
+                raise unreadable("file", first_line(error), "arrays that can be read") from None
+            yield np.column_stack([*(own[name] for name in extra), *read])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import IO, Any, Literal, cast
 
 from lipcore.extras import import_extra
 from service.datasets.formats.table import first_line, unreadable
-from service.datasets.formats.zips import COPY_BYTES, check_unpacked_size, open_zip
+from service.datasets.formats.zips import COPY_BYTES, ERRORS, check_unpacked_size, open_zip
 from service.foundation.errors import TooLargeError
 from service.foundation.settings import Settings
 
@@ -38,7 +37,10 @@ def _open(path: Path, compression: Compression, settings: Settings, stack: ExitS
         archive = stack.enter_context(open_zip(path, "a zip archive with one file"))
         members = [each for each in archive.infolist() if not each.is_dir()]
         check_unpacked_size(members, settings)
-        return stack.enter_context(archive.open(members[0]))
+        try:
+            return stack.enter_context(archive.open(members[0]))
+        except ERRORS as error:
+            raise unreadable("file", first_line(error), "a complete zip archive") from None
     pa: Any = import_extra("pyarrow", "ingest")
     return cast(IO[bytes], pa.CompressedInputStream(stack.enter_context(path.open("rb")), compression))
 
@@ -46,7 +48,5 @@ def _open(path: Path, compression: Compression, settings: Settings, stack: ExitS
 def _read(source: IO[bytes], compression: str) -> bytes:
     try:
         return source.read(COPY_BYTES)
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-        if getattr(error, "errno", None) is not None:
-            raise  # of the disk
+    except ERRORS as error:
         raise unreadable("file", first_line(error), f"a complete {compression} file") from None

@@ -11,6 +11,7 @@ import scipy.io
 
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, TooLargeError
+from tests.service.data import post
 from tests.service.datasets.reading import read_rejected
 from tests.service.datasets.same_samples import DATA, FRAME, STAMPS, check_same, samples
 
@@ -164,16 +165,27 @@ def test_sheet_is_chosen_and_read_with_its_units(tmp_path):
     assert read_rejected(tmp_path, out.getvalue(), None, ReadOptions(topic="Log 2"))[2].endswith("Sheet, Log 1, other")
 
 
-@pytest.mark.parametrize(
-    "body",
-    [hdf5(DATA), mat(DATA), npy(RECORD), feather(FRAME), excel(FRAME)],
-    ids=["hdf5", "mat", "npy", "feather", "xlsx"],
-)
+@pytest.mark.parametrize("body", [npy(RECORD), feather(FRAME), excel(FRAME)], ids=["npy", "feather", "xlsx"])
 def test_damaged_files_are_read_or_rejected(tmp_path, body):
+    for broken in damaged(body, 60):
+        with suppress(InvalidDataError, TooLargeError):
+            samples(tmp_path, broken)
+
+
+@pytest.mark.parametrize(
+    ("body", "media_type"), [(hdf5(DATA), "application/x-hdf5"), (mat(DATA), "application/x-matlab-data")]
+)
+def test_damage_that_crashes_a_library_ends_only_its_process(api, body, media_type):
+    for broken in damaged(body, 25):
+        assert post(api, broken, media_type).status_code in (201, 413, 422)
+    assert post(api, body, media_type).status_code == 201
+
+
+def damaged(body, count):
+    """Yield damaged variants of a file, a third of them cut off."""
     rng = np.random.default_rng(5)
-    for number in range(60):
+    for number in range(count):
         broken = bytearray(body if number % 3 else body[: rng.integers(len(body))])
         for place in rng.integers(0, max(len(broken), 1), 4):
             broken[place : place + 2] = rng.bytes(2)
-        with suppress(InvalidDataError, TooLargeError):
-            samples(tmp_path, bytes(broken))
+        yield bytes(broken)

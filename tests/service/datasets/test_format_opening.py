@@ -60,14 +60,13 @@ def tar():
 @pytest.mark.parametrize(
     ("body", "name"),
     [
-        (b"\x89HDF\r\n\x1a\n" + bytes(100), "HDF5"),
-        (b"MATLAB 5.0 MAT-file, Platform: GLNXA64" + bytes(100), "MATLAB"),
+        (b"7z\xbc\xaf\x27\x1c" + bytes(100), "7z"),
         (pickle.dumps({"q": [1.0]}), "a pickle"),
         (b"\xfd7zXZ\0" + bytes(100), "xz"),
         (b"\x89PNG\r\n\x1a\n" + bytes(100), "an image"),
         (b"", "empty"),
     ],
-    ids=["HDF5", "MATLAB", "pickle", "xz", "image", "empty"],
+    ids=["7z", "pickle", "xz", "image", "empty"],
 )
 def test_unsupported_format_is_named_with_the_declared_one(tmp_path, reply, body, name):
     _, value, expected = check_rejected(tmp_path, body, reply, "file")

@@ -7,7 +7,7 @@ IMPORT, TAR = "/v1/models/import", "application/x-tar"
 TEXTS = ((DATASETS, CSV), (ROBOTS, XML))
 PATHS = (DATASETS, ROBOTS, IMPORT)
 UNSUPPORTED = ("", "text/plain", "application/octet-stream", "text/csvx", "*/*", "a" * 500)
-UNSUPPORTED_FILES = (b"data.xlsx", b"data", b".csv.exe")
+UNSUPPORTED_FILES = (b"data.docx", b"data", b".csv.exe")
 TYPE = ("unsupported_media_type", 415)
 UNNAMED = ("", "%20", "%0A", "a%00", "%1B[31ma", "a%E2%80%AEvsc", "a%E2%80%8Bb", "%EF%BB%BFa", "a%C2%85", "a" * 201)
 """Names that are not accepted."""
