@@ -9,6 +9,7 @@ from fastapi.testclient import TestClient
 
 from service.api.dashboard import plotly
 from service.api.dashboard.routes import STATIC
+from service.contract.media_types import SUFFIXES
 from tests.service.data import error
 
 FILES = sorted(path.relative_to(STATIC).as_posix() for path in STATIC.rglob("*") if path.is_file())
@@ -35,6 +36,10 @@ def test_no_file_refers_to_another_host():
     for file in FILES:
         result = set(re.findall(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}", (STATIC / file).read_text()))
         assert result <= {"http://www.w3.org"}, file
+
+
+def test_files_of_all_formats_can_be_chosen():
+    assert f'const EXTENSIONS = "{",".join(SUFFIXES)}";' in SCRIPTS["pages/data/upload.js"]
 
 
 def test_imported_names_are_exported_and_used():

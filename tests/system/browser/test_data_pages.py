@@ -5,6 +5,8 @@ import re
 import numpy as np
 
 from lipcore.estimators.catalogue import ESTIMATORS
+from lipcore.robots.library import profile_urdf
+from lipcore.robots.urdf_units import scaled
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.service.data import ENDLESS, arrays, columns, csv, ended, job, npz, queue, stream, upload
 from tests.system.browser.accessibility import audit, expect
@@ -52,6 +54,20 @@ def test_rejected_recording_is_imported_with_the_proposed_option(visitor: Visito
     names = {each["name"] for each in dashboard.client.get("/v1/datasets").json()["items"]}
     assert "in degrees" not in names
     assert "pendulum.npz" in names
+
+
+def test_urdf_in_other_units_is_added_with_the_proposed_scale(visitor: Visitor, dashboard: Dashboard) -> None:
+    visitor.expect_refusals(422)
+    exported = scaled(profile_urdf("kinova"), {"length": 1e3, "inertia": 1e6})
+    page = visitor.open("#/data")
+    page.get_by_text("Import options: robot").click()
+    page.get_by_label("URDF to upload").set_input_files([file("arm.urdf", exported.encode())])
+    expect(page.get_by_text("This fits length in mm, inertia in kg·mm²").first).to_be_visible()
+    assert audit(page) == []
+    page.get_by_role("button", name="Upload in these units").click()
+    expect(page.get_by_text(re.compile("added, 6 joints"))).to_be_visible()
+    for robot in dashboard.client.get("/v1/robots").json()["items"]:
+        dashboard.client.delete(f"/v1/robots/{robot['id']}")
 
 
 def test_import_options_set_how_a_file_is_read(visitor: Visitor) -> None:

@@ -8,7 +8,7 @@ import { button, card, field, link, notice, progress } from "../../ui.js";
 import { describeOptions, uploadOptions, withOption } from "./options.js";
 import { uploadError } from "./upload_error.js";
 
-const EXTENSIONS = ".csv,.tsv,.txt,.npz,.parquet,.pq,.ndjson,.jsonl,.json,.db3,.bag,.mcap,.zip";
+const EXTENSIONS = ".csv,.tsv,.txt,.npz,.parquet,.pq,.ndjson,.jsonl,.json,.db3,.bag,.mcap,.zip,.feather,.arrow,.h5,.hdf5,.mat,.npy,.xlsx,.gz,.zst";
 
 /** Create the upload card. onUploaded(dataset) is called after each upload. Returns {element, fillRobots(robots)}. */
 export function uploader({ onUploaded, signal }) {
@@ -22,7 +22,7 @@ export function uploader({ onUploaded, signal }) {
     { class: "empty" },
     h("p", {}, "Drop recordings anywhere on this page, or choose files."),
     h("div", { class: "actions" }, choose, input),
-    h("p", { class: "hint" }, "CSV, Parquet, NPZ, JSON, rosbag1, rosbag2, MCAP, LeRobot (zip). Required columns: time, position and torque."),
+    h("p", { class: "hint" }, "CSV, Excel, Parquet, HDF5, MATLAB, NumPy, JSON, rosbag1, rosbag2, MCAP, LeRobot (zip), also compressed. Required columns: time, position and torque."),
     missingExtraHint("ingest"),
   );
   const ready = h("div", { hidden: true });

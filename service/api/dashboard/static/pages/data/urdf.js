@@ -10,18 +10,23 @@ import { button, errorBox, notice } from "../../ui.js";
 export function urdfButton(onAdded) {
   const input = h("input", { type: "file", accept: ".urdf,.xml", hidden: true, "aria-label": "URDF to upload" });
   const problem = h("div", {});
-  input.addEventListener("change", async () => {
-    const [file] = input.files;
-    input.value = "";
-    if (!file) return;
+  // scale: factors to SI units that an error message proposed
+  const send = async (file, scale) => {
     replace(problem);
     try {
-      const robot = await upload(file, {}, undefined, undefined, "/v1/robots");
+      const robot = await upload(file, { scale }, undefined, undefined, "/v1/robots");
       notice(`${robot.name} added, ${counted(robot.joints.length, "joint")}.`);
       onAdded(robot);
     } catch (error) {
-      replace(problem, errorBox(error));
+      const proposed = /set scale=([\w=.,-]+)/.exec(error.message)?.[1];
+      const mend = proposed && h("div", { class: "actions" }, button("Upload in these units", () => send(file, proposed)));
+      replace(problem, errorBox(error), mend ?? null);
     }
+  };
+  input.addEventListener("change", () => {
+    const [file] = input.files;
+    input.value = "";
+    if (file) send(file, "");
   });
   const add = button("Add a URDF", () => input.click());
   return h("div", {}, h("div", { class: "actions" }, add, input), missingExtraHint("robots", add), problem);
