@@ -219,6 +219,23 @@ def recording_of(data: str) -> Path | None:
     return None
 
 
+def robot_of(client: Client, robot: str) -> str:
+    """Return the id of a robot. A .urdf file is uploaded, unless it is there already; raise CommandError."""
+    if not robot.endswith(".urdf"):
+        return robot
+    path = Path(robot)
+    if not path.is_file():
+        raise CommandError(f"--robot is {robot!r}, but this file does not exist")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    known = (each.id for each in islice(client.robots(), MAX_KNOWN_ROBOTS) if each.sha256 == digest)
+    with advised(f"`lipserve robots add {shlex.quote(robot)}` has options for units; then use its id as --robot"):
+        return next(known, None) or client.upload_robot(path).id
+
+
+MAX_KNOWN_ROBOTS = 200
+"""Max number of uploaded robots that are compared with a file."""
+
+
 def upload(client: Client, paths: Sequence[Path], name: str | None = None, **reading: Any) -> Dataset:
     """Upload a recording; the same content with the same name and options gives the same data set.
 

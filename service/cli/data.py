@@ -12,7 +12,7 @@ from rich.markup import escape
 from lipserve.address import DEFAULT_URL
 from lipserve.asking import Reading
 from service.cli import connecting
-from service.cli.connecting import advised, connected, upload
+from service.cli.connecting import advised, connected, robot_of, upload
 from service.cli.consoles import echo, out, print_json, print_result
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
 from service.cli.wording import in_shell
@@ -35,7 +35,7 @@ def add(
         list[Path], typer.Argument(exists=True, dir_okay=False, help=f"Recordings to upload: {', '.join(SUFFIXES)}.")
     ],
     name: Annotated[str | None, typer.Option(help="Name of the data set. Default: the file's name.")] = None,
-    robot: Annotated[str | None, typer.Option(help="Profile such as panda, or id of an uploaded URDF.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Profile such as panda, id of a URDF, or a .urdf file.")] = None,
     joint_names: Annotated[str | None, typer.Option(help="Names of joints 1 to n, separated by commas.")] = None,
     joints: Annotated[str | None, typer.Option(help="Joints to keep, in this order.")] = None,
     drop_joints: Annotated[str | None, typer.Option("--drop", help="Joints to drop. They must not move.")] = None,
@@ -108,6 +108,8 @@ def add(
     parts = [files] if join else [[each] for each in files]
     hint = "if the files are parts of one recording, add --join" if len(parts) > 1 else None
     with connected(url) as client, advised(hint):
+        if robot is not None:
+            reading["robot"] = robot_of(client, robot)
         made = [upload(client, part, name, **reading) for part in parts]
     if as_json:
         print_json(made if len(made) > 1 else made[0])

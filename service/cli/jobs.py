@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -15,14 +14,13 @@ from rich.table import Column, Table
 from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES
 from lipserve.address import DEFAULT_URL
 from service.cli import connecting
-from service.cli.connecting import PATIENCE, advised, connected, dataset_of, recording_of, watch
+from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, robot_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json, print_warnings
 from service.cli.models import print_held_out, print_promotion, print_selection
 from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Promotion, Url, alone, group, names, pairs, value
 from service.foundation.text import percent
 
 if TYPE_CHECKING:
-    from lipserve import Client
     from lipserve.records.jobs import Job
 
 
@@ -208,7 +206,7 @@ def train(
             client.dataset(each)
         datasets = [dataset_of(client, each) for each in data]
         if urdf is not None:
-            request["robot"] = _upload_robot(client, urdf)
+            request["robot"] = robot_of(client, str(urdf))
         queue = partial(client.train, model, datasets, **request, idempotency_key=new_key())  # type: ignore[arg-type]
         try:
             job = queue()
@@ -246,13 +244,6 @@ def train(
     print_warnings(made.warnings)
     if waits:
         note(f"`lipserve models promote {model} {job.version}` makes it the serving version")
-
-
-def _upload_robot(client: Client, path: Path) -> str:
-    """Upload a URDF; return its id."""
-    command = f"`lipserve robots add {shlex.quote(str(path))}` has options for units; then use its id as --robot"
-    with advised(command):
-        return client.upload_robot(path).id
 
 
 def _holdout(share: float | None, kind: str | None, only: bool) -> dict[str, Any] | Literal[False] | None:

@@ -44,7 +44,13 @@ def open_zip(path: Path, expected: str) -> Iterator[zipfile.ZipFile]:
             seen: set[str] = set()
             for member in members:
                 name = member.orig_filename
-                if not name.isprintable() or "\\" in name or name.startswith("/") or ".." in name.split("/"):
+                if (
+                    not name
+                    or not name.isprintable()
+                    or "\\" in name
+                    or name.startswith("/")
+                    or ".." in name.split("/")
+                ):
                     raise invalid_data("member", name, "a plain path inside the archive")
                 if name in seen:
                     raise invalid_data("member", name, "each member only once")

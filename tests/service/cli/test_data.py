@@ -1,5 +1,6 @@
 """`lipserve data` and `lipserve simulate`."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from lipcore.data.samples import Samples
 from lipcore.profiles import profile
 from lipcore.robots.dirt import Dirt
-from lipcore.robots.library import ROBOTS
+from lipcore.robots.library import ROBOTS, profile_urdf
 from lipcore.robots.simulation import Payload
 from service.cli.simulate import write_recording
 from service.datasets.formats.opening import open_table
@@ -196,3 +197,15 @@ def test_added_data_set_is_listed_shown_and_deleted(run_command, run_rejected_co
     assert f"no dataset '{made[0]}'" in run_rejected_command("data", "show", made[0])
     assert "effort" in run_rejected_command("data", "add", paths[0], "--effort", "volts")
     assert "--unit must have the form NAME=VALUE" in run_rejected_command("data", "add", paths[0], "--unit", "deg")
+
+
+def test_urdf_file_of_a_robot_is_uploaded_once(run_command, recording, tmp_path):
+    path = tmp_path / "mine.urdf"
+    text = re.sub("<robot[^>]*>", '<robot name="mine">', profile_urdf("double-pendulum"), flags=re.DOTALL)
+    path.write_text(text)
+    robots = {
+        run_command("data", "add", recording(seed), "--robot", path, "--json")["report"]["robot"] for seed in (5, 6)
+    }
+    uploaded = [each["id"] for each in run_command("robots", "list", "--json")["uploaded"] if each["name"] == "mine"]
+    assert robots == set(uploaded)
+    assert len(uploaded) == 1
