@@ -203,9 +203,7 @@ def test_urdf_file_of_a_robot_is_uploaded_once(run_command, recording, tmp_path)
     path = tmp_path / "mine.urdf"
     text = re.sub("<robot[^>]*>", '<robot name="mine">', profile_urdf("double-pendulum"), flags=re.DOTALL)
     path.write_text(text)
-    robots = {
-        run_command("data", "add", recording(seed), "--robot", path, "--json")["report"]["robot"] for seed in (5, 6)
-    }
-    uploaded = [each["id"] for each in run_command("robots", "list", "--json")["uploaded"] if each["name"] == "mine"]
-    assert robots == set(uploaded)
-    assert len(uploaded) == 1
+    for seed in (5, 6):
+        report = run_command("data", "add", recording(seed), "--robot", path, "--json")["report"]
+        assert report["robot"] == "mine"
+    assert [each["name"] for each in run_command("robots", "list", "--json")["uploaded"]].count("mine") == 1
