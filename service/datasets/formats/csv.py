@@ -12,6 +12,7 @@ import pyarrow.csv as pacsv
 from lipcore.data.samples import Array
 from service.datasets.formats.arrow import Node
 from service.datasets.formats.cells import MISSING, ClockCells, NumberCells, StampCells, plan_cells
+from service.datasets.formats.header import Naming
 from service.datasets.formats.joint_labels import JointCycle, JointNames
 from service.datasets.formats.table import (
     MAX_COLUMNS,
@@ -22,7 +23,7 @@ from service.datasets.formats.table import (
     stack_blocks,
     unreadable,
 )
-from service.datasets.formats.text import BLANK, MAX_LINE_BYTES, Naming, TextLayout, TextLines, byte_error, read_layout
+from service.datasets.formats.text import BLANK, MAX_LINE_BYTES, TextLayout, TextLines, byte_error, read_layout
 from service.datasets.formats.transposed import open_transposed
 from service.datasets.options import ReadOptions
 from service.foundation.errors import invalid_data, invalid_request
