@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import cast
 
 from lipcore.profiles.profile import read_limits
 from lipcore.robots import urdf_text, urdf_units
 from lipcore.robots.library import pinocchio
+from lipcore.robots.mjcf import convert_mjcf, is_mjcf
 from lipcore.robots.urdf import Description, describe
 from lipcore.robots.urdf_text import UrdfError
 from lipcore.robots.urdf_units import Scale
@@ -27,9 +29,14 @@ class ReadUrdf:
     description: Description
 
 
-def read_urdf(urdf: str, scale: dict[str, float]) -> ReadUrdf:
-    """Return a URDF in SI units. scale: factors of its quantities. Raise InvalidDataError naming the error in it."""
+def read_urdf(urdf: str, scale: dict[str, float], folder: Path) -> ReadUrdf:
+    """Return a URDF, or an MJCF as URDF, in SI units. scale: factors of its quantities; folder: for temporary files.
+
+    Raise InvalidDataError naming the error in it.
+    """
     try:
+        if is_mjcf(urdf):
+            urdf = convert_mjcf(urdf, folder)
         if scale:
             urdf_text.read_urdf(urdf)
             urdf = urdf_units.scaled(urdf, cast(Scale, scale))

@@ -6,6 +6,8 @@ import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from sqlalchemy import select
 from sqlalchemy.orm import undefer
@@ -44,7 +46,9 @@ def add(database: Database, content: bytes, name: str | None, scale: str | None,
     except UnicodeDecodeError as error:
         raise invalid_urdf(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
     function, factors = "service.robots.caged:read_urdf", _factors(scale)
-    read = cage.run(function, ReadUrdf, urdf, factors, settings=settings, field="urdf")
+    with TemporaryDirectory(dir=settings.home) as given:
+        folder = Path(given)
+        read = cage.run(function, ReadUrdf, urdf, factors, folder, settings=settings, folder=folder, field="urdf")
     urdf, described = read.urdf, read.description
     row = RobotRow(
         id=new_id("urdf"),

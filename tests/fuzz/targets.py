@@ -75,8 +75,9 @@ def _recording(kind: str) -> Callable[[bytes], None]:
 
 def _urdf(data: bytes) -> None:
     text = data.decode("utf-8-sig", "replace")
-    read_urdf(text, {})
-    read_urdf(text, {"length": 0.5, "mass": 2.0, "inertia": 0.1})
+    with tempfile.TemporaryDirectory() as folder:
+        read_urdf(text, {}, Path(folder))
+        read_urdf(text, {"length": 0.5, "mass": 2.0, "inertia": 0.1}, Path(folder))
     from_urdf(text, "fuzzed")  # a URDF that can be read can also be used
 
 

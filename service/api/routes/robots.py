@@ -48,7 +48,7 @@ async def upload(
         Query(max_length=100, description="Factors to SI units: `length=0.001,inertia=1e-9` for mm and g·mm²"),
     ] = None,
 ) -> Robot:
-    """Check a URDF and store it as a robot. Files that it refers to, such as meshes, are not opened.
+    """Check a URDF and store it as a robot; MuJoCo's MJCF is converted. Files that it refers to are not opened.
 
     A wrong URDF is rejected: `detail` names what is wrong.
     """
