@@ -59,7 +59,7 @@ def check_bodies(urdf: str, parse: Callable[[str], Any]) -> None:
 
 
 def scaled(urdf: str, scale: Scale) -> str:
-    """Return a URDF in SI units. urdf: as `urdf_text.read_urdf` accepts it. Raise UrdfError for another scale.
+    """Return a URDF in SI units. urdf: the `plain` text of `urdf_text.read_urdf`. Raise UrdfError for another scale.
 
     Example:
         >>> scaled('<robot><link name="b"><inertial><mass value="5"/></inertial></link></robot>', {"mass": 0.1})

@@ -38,8 +38,7 @@ def read_urdf(urdf: str, scale: dict[str, float], folder: Path) -> ReadUrdf:
         if is_mjcf(urdf):
             urdf = convert_mjcf(urdf, folder)
         if scale:
-            urdf_text.read_urdf(urdf)
-            urdf = urdf_units.scaled(urdf, cast(Scale, scale))
+            urdf = urdf_units.scaled(urdf_text.read_urdf(urdf).plain, cast(Scale, scale))
         described = describe(urdf)
         read_limits(urdf, described.joint_names)
     except UrdfError as error:
