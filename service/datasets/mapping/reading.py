@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,13 @@ def read(
     and rows that repeat the time of the row before.
     """
     mapped = map_columns(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
-    reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings, min_samples)
-    for block in table.blocks:
+    first = next(table.blocks, None)
+    without = {} if first is None or robot is not None else _without_effort(mapped, first)
+    if without:
+        fewer = replace(options, drop_joints=(*options.drop_joints, *without))
+        mapped = map_columns(table.names, table.units, table.joint_names, fewer, robot, settings.max_joints)
+    reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings, min_samples, without)
+    for block in chain([] if first is None else [first], table.blocks):
         reader.add(block)
     reader.finish()
     noted = [*table.facts, *mapped.notes, *reader.notes()]
@@ -89,11 +95,30 @@ def read(
     return ReadResult(reader.staged, mapped.torque.convention, facts, noted)
 
 
+def _without_effort(mapped: ColumnMap, block: Array) -> dict[str, Source]:
+    """Return the torque columns of joints, such as wheels, that have no value in a block, if others have some."""
+    found = {
+        joint: source
+        for joint, source in zip(mapped.joints, mapped.quantities["tau"], strict=True)
+        if not np.isfinite(block[:, source.index]).any()
+    }
+    return found if len(found) < len(mapped.joints) else {}
+
+
 class _Reader:
     """Stages the blocks of a table and collects the statistics for the final checks."""
 
-    def __init__(self, mapped: ColumnMap, staged: Staged, settings: Settings, min_samples: int) -> None:
+    def __init__(
+        self,
+        mapped: ColumnMap,
+        staged: Staged,
+        settings: Settings,
+        min_samples: int,
+        without: Mapping[str, Source],
+    ) -> None:
         self.mapped, self.staged, self.settings, self.min_samples = mapped, staged, settings, min_samples
+        self.without = without
+        """Torque columns of joints that are left out because they have no effort."""
         self.rows = 0
         self.time = ColumnStats(mapped.t[0].name) if mapped.t else None
         self.time_has_unit = any(each.unit is not None for each in mapped.t)
@@ -111,6 +136,11 @@ class _Reader:
         if self.rows > self.settings.max_samples:
             expected = f"at most {self.settings.max_samples}"
             raise invalid_data("rows", self.rows, expected, f"The file has too many rows, expected {expected}.")
+        for joint, source in self.without.items():
+            if (given := np.isfinite(block[:, source.index])).any():
+                where, value = f"{source.name}, row {rows[given.argmax()]}", block[given.argmax(), source.index]
+                expected = f"no value, as in the first rows. Leave out the joint with drop_joints={joint}"
+                raise invalid_data(where, float(value), expected)
         episode = None
         if self.mapped.episode is not None:
             episode = np.ascontiguousarray(block[:, self.mapped.episode.index])
@@ -139,6 +169,8 @@ class _Reader:
     def notes(self) -> list[str]:
         """Return sentences on values that were changed or not used."""
         out = [f"{quantity} has no values and is ignored" for quantity in MOTION if quantity in self.absent]
+        if self.without:
+            out.append(f"joints without effort are left out: {', '.join(self.without)}")
         for name, turns in zip(self.mapped.joints, self.turns, strict=True):
             if turns.count:
                 out.append(

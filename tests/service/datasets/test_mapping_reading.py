@@ -316,15 +316,28 @@ def test_episodes_of_a_real_schunk_are_mapped(tmp_path):
         np.testing.assert_array_equal(result.staged.read("episode"), file["episode"])
 
 
-def test_remedy_names_all_joints_without_effort(reading):
-    """Wheels and grippers have no effort."""
+def test_joints_without_effort_are_left_out(reading):
+    """Wheels and grippers have none."""
     data = motion(n=4)
     data["tau"][:, [0, 2]] = np.nan
+    kept = reading(canonical(data))
+    assert kept.staged.joint_names == ("joint2", "joint4")
+    np.testing.assert_array_equal(kept.staged.table("tau"), data["tau"][:, [1, 3]])
+    assert "joints without effort are left out: joint1, joint3" in kept.noted
+    data["tau"][150, 2] = 1.5
+    check_rejected(reading, canonical(data), "Leave out the joint with drop_joints=joint3", "tau3, row 151")
+    assert (
+        reading(canonical(data), options(drop_joints=("joint1", "joint3"))).staged.joint_names
+        == kept.staged.joint_names
+    )
+
+
+def test_remedy_names_all_joints_without_velocity(reading):
+    data = motion(n=4)
+    data["dq"][:, [0, 2]] = np.nan
     with pytest.raises(InvalidDataError) as caught:
         reading(canonical(data))
     assert caught.value.detail[0].expected.endswith("drop_joints=joint1,joint3")
-    kept = reading(canonical(data), options(drop_joints=("joint1", "joint3")))
-    assert kept.staged.joint_names == ("joint2", "joint4")
 
 
 def test_one_joint_of_a_robot_is_read(reading):
