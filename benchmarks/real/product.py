@@ -15,7 +15,7 @@ from benchmarks.real.rivals import Forecast
 from benchmarks.workload import BenchError
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.samples import Samples
-from lipserve import Client
+from lipserve import Client, Prediction
 from lipserve.asking import Reading
 from lipserve.states import SUCCEEDED
 from service.cli.demo import ServiceProcess
@@ -80,7 +80,7 @@ class Bed:
 
     def predict(self, trained: Trained, samples: Samples) -> Forecast:
         """Predict the torque along the motion, and the standard deviation equivalent to the 95 % interval."""
-        means, halves = [], []
+        found = []
         for part in samples.episodes():
             episode, history = samples.rows(part), None
             for start in range(0, len(episode), BATCH_ROWS):
@@ -89,10 +89,14 @@ class Bed:
                     trained.model, rows.q, rows.dq, rows.ddq, version=trained.version, t=rows.t, history=history
                 )
                 history = rows.t, rows.q, rows.dq
-                low, high = answer.interval(LEVEL)
-                means.append(answer.tau)
-                halves.append((high - low) / 2)
-        return Forecast(np.concatenate(means), np.concatenate(halves) / quantile(LEVEL))
+                found.append(forecast_of(answer))
+        return Forecast(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def forecast_of(answer: Prediction) -> Forecast:
+    """Return the torque of an answer, and the standard deviation equivalent to its 95 % interval."""
+    low, high = answer.interval(LEVEL)
+    return Forecast(answer.tau, (high - low) / (2 * quantile(LEVEL)))
 
 
 @contextmanager

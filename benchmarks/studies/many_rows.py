@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from benchmarks.real.product import Bed, open_bed
+from benchmarks.real.product import Bed, forecast_of, open_bed
 from benchmarks.real.rivals import Forecast
 from benchmarks.studies.dirty_arms import recorded, recording
 from lipcore.data.metrics import LEVEL, quantile
@@ -159,9 +159,7 @@ def by_minute(samples: Samples) -> Iterator[list[tuple[int, Samples]]]:
 def ask(bed: Bed, past: Samples, rows: Samples) -> Forecast:
     """Predict rows after others, by the serving version."""
     history = (past.t, past.q, past.dq) if len(past) else None
-    answer = bed.client.predict("repeat", rows.q, rows.dq, rows.ddq, t=rows.t, history=history)
-    low, high = answer.interval(LEVEL)
-    return Forecast(answer.tau, (high - low) / (2 * quantile(LEVEL)))
+    return forecast_of(bed.client.predict("repeat", rows.q, rows.dq, rows.ddq, t=rows.t, history=history))
 
 
 def ask_fast(bed: Bed, past: Samples, rows: Samples) -> Array:

@@ -8,12 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 
 from lipcore.robots.library import pinocchio
-from lipcore.robots.urdf_text import MAX_DEPTH, UrdfError
+from lipcore.robots.urdf_text import MAX_DEPTH, UrdfError, scan
 
 PROBE = """<mujoco model="probe"><worldbody><body name="a"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
 <joint name="b" type="slide" range="0 1"/></body></worldbody></mujoco>"""
@@ -39,13 +38,7 @@ def convert_mjcf(text: str, folder: Path) -> str:
     A robot with a free or ball joint, two joints in one body, or a moving body without mass is rejected.
     """
     scanner = _Scanner()
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = scanner.start, scanner.end
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = scanner.refuse
-    try:
-        parser.Parse(text, True)
-    except (expat.ExpatError, UnicodeEncodeError) as error:
-        raise UrdfError(f"the MJCF is not well-formed XML: {error}") from None
+    scan(text, "MJCF", scanner)
     model = _build(ElementTree.tostring(scanner.root, encoding="unicode"), folder)
     angles = {each.get("angle", "degree") for each in scanner.root.iter("compiler")} or {"degree"}
     # some versions of Pinocchio also convert the ranges of slides from degrees
@@ -91,9 +84,6 @@ class _Scanner:
 
     def end(self, tag: str) -> None:
         self._path.pop()
-
-    def refuse(self, *_: Any) -> None:
-        raise UrdfError("the MJCF declares a document type or an entity, expected plain XML")
 
 
 def _urdf_of(model: Any, name: str, slide: float) -> str:

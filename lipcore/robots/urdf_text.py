@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 from xml.etree import ElementTree
 from xml.parsers import expat
 
@@ -76,15 +76,7 @@ def read_urdf(urdf: str) -> UrdfText:
     Raise UrdfError.
     """
     scanner = _Scanner()
-    parser = expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = scanner.start, scanner.end
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = scanner.refuse_declaration
-    try:
-        parser.Parse(urdf, True)
-    except expat.ExpatError as error:
-        raise UrdfError(f"the URDF is not well-formed XML: {error}") from None
-    except UnicodeEncodeError as error:
-        raise UrdfError(f"the URDF is not text: {error}") from None
+    scan(urdf, "URDF", scanner)
     links, entries = scanner.root.findall("link"), scanner.root.findall("joint")
     if len(links) > MAX_LINKS:
         raise UrdfError(f"the URDF has {len(links)} links, expected at most {MAX_LINKS}")
@@ -97,6 +89,35 @@ def read_urdf(urdf: str) -> UrdfText:
                 f"{', '.join(MOVABLE)} or fixed"
             )
     return UrdfText(scanner.root.get("name", ""), joints, ElementTree.tostring(scanner.root, encoding="unicode"))
+
+
+class Scanner(Protocol):
+    """Handlers of the elements of a document."""
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        """Handle the start of an element."""
+
+    def end(self, tag: str) -> None:
+        """Handle its end."""
+
+
+def scan(text: str, form: str, scanner: Scanner) -> None:
+    """Pass the elements of a document to a scanner; raise UrdfError for wrong XML or a declaration. form: its name."""
+
+    def refuse_declaration(*_: Any) -> None:
+        raise UrdfError(
+            f"the {form} declares a document type or an entity (<!DOCTYPE>, <!ENTITY>), which is not accepted"
+        )
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = scanner.start, scanner.end
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse_declaration
+    try:
+        parser.Parse(text, True)
+    except expat.ExpatError as error:
+        raise UrdfError(f"the {form} is not well-formed XML: {error}") from None
+    except UnicodeEncodeError as error:
+        raise UrdfError(f"the {form} is not text: {error}") from None
 
 
 def _joint(entry: ElementTree.Element) -> UrdfJoint:
@@ -158,9 +179,6 @@ class _Scanner:
 
     def end(self, _tag: str) -> None:
         self._path.pop()
-
-    def refuse_declaration(self, *_: Any) -> None:
-        raise UrdfError("the URDF declares a document type or an entity (<!DOCTYPE>, <!ENTITY>), which is not accepted")
 
     def _checked(self, tag: str, attributes: dict[str, str]) -> dict[str, str]:
         """Return those attributes of an element that are used, with checked numbers in plain notation."""

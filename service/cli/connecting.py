@@ -219,13 +219,19 @@ def recording_of(data: str) -> Path | None:
     return None
 
 
+def urdf_of(robot: str | None) -> Path | None:
+    """Return the .urdf file that an argument names, None if it names another robot; raise CommandError."""
+    if robot is None or not robot.endswith(".urdf"):
+        return None
+    if not Path(robot).is_file():
+        raise CommandError(f"--robot is {robot!r}, but this file does not exist")
+    return Path(robot)
+
+
 def robot_of(client: Client, robot: str) -> str:
     """Return the id of a robot. A .urdf file is uploaded, unless it is there already; raise CommandError."""
-    if not robot.endswith(".urdf"):
+    if (path := urdf_of(robot)) is None:
         return robot
-    path = Path(robot)
-    if not path.is_file():
-        raise CommandError(f"--robot is {robot!r}, but this file does not exist")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     known = (each.id for each in islice(client.robots(), MAX_KNOWN_ROBOTS) if each.sha256 == digest)
     with advised(f"`lipserve robots add {shlex.quote(robot)}` has options for units; then use its id as --robot"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from itertools import islice
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -14,7 +13,7 @@ from rich.table import Column, Table
 from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES
 from lipserve.address import DEFAULT_URL
 from service.cli import connecting
-from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, robot_of, watch
+from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, robot_of, urdf_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json, print_warnings
 from service.cli.models import print_held_out, print_promotion, print_selection
 from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Promotion, Url, alone, group, names, pairs, value
@@ -187,9 +186,7 @@ def train(
     options: dict[str, Any] = {name: value(text) for name, text in pairs("--option", option).items()}
     if prior is not None:
         options["prior"] = prior
-    urdf = None if robot is None or not robot.endswith(".urdf") else Path(robot)
-    if urdf is not None and not urdf.is_file():
-        raise CommandError(f"--robot is {robot!r}, but this file does not exist")
+    urdf = urdf_of(robot)
     request = {
         "estimator": estimator,
         "joint_types": names(joint_types),

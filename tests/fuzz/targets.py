@@ -34,7 +34,7 @@ SMALL = {
     "formats.table.MAX_COLUMNS": 200,
     "formats.json.MAX_COLUMNS": 200,
     "formats.npz.MAX_COLUMNS": 200,
-    **{f"formats.{name}.MAX_COLUMNS": 200 for name in ("arrow", "arrays", "csv", "transposed", "workbook")},
+    **{f"formats.{name}.MAX_COLUMNS": 200 for name in ("arrow", "csv", "transposed", "workbook")},
     "formats.zips.MAX_MEMBERS": 50,
     "formats.bags.container.MAX_PART_BYTES": 4 * MiB,
     "formats.bags.files.MAX_PART_BYTES": 4 * MiB,

@@ -18,14 +18,7 @@ import numpy as np
 import scipy.io
 
 from lipcore.data.samples import Array
-from service.datasets.formats.table import (
-    MAX_COLUMNS,
-    Table,
-    block_rows,
-    clean_names,
-    first_line,
-    unreadable,
-)
+from service.datasets.formats.table import Table, block_rows, clean_names, first_line, name_columns, unreadable
 from service.datasets.mapping.recognition import find_times, interpret_name
 from service.datasets.options import ReadOptions
 from service.foundation.errors import TooLargeError, invalid_data
@@ -134,13 +127,11 @@ def open_npy(path: Path, options: ReadOptions, settings: Settings) -> Iterator[T
     if options.column_names is None:
         expected = f"names of its {width} columns. Set column_names=t,q1..q7,tau1..tau7"
         raise invalid_data("column_names", "missing", expected)
-    if len(options.column_names) != width:
-        expected = f"{width} names because the rows have {width} values"
-        raise invalid_data("column_names", f"{len(options.column_names)} names", expected)
+    names = clean_names(name_columns(options.column_names, width))
     whole = Part({"": array}, rows)
     steps = range(0, rows, block_rows(width))
     blocks = (whole.read("", begin, min(begin + block_rows(width), rows)) for begin in steps)
-    yield Table(clean_names(options.column_names), blocks)
+    yield Table(names, blocks)
 
 
 def _flatten(name: str, value: Any, out: dict[str, Any]) -> None:
@@ -181,8 +172,6 @@ def _table(arrays: Mapping[str, Any], options: ReadOptions, settings: Settings, 
         (float(np.ravel(arrays[name])[0]) for name in STEPS if name in arrays and np.size(arrays[name]) == 1), None
     )
     step = None if find_times(names) or options.dt is not None else step
-    if len(names) > MAX_COLUMNS:
-        raise invalid_data("columns", len(names), f"at most {MAX_COLUMNS}")
     extra = ["episode"] * (len(parts) > 1 and "episode" not in names) + ["t"] * (step is not None)
     return Table(clean_names([*extra, *names]), _blocks(parts, used, len(names), extra, step), facts=facts)
 

@@ -86,9 +86,7 @@ class ArrowColumns:
         """
         out, ignored = cls({}, [], {}, []), []
         for column in schema:
-            first = pa.array(
-                [], column.type.storage_type if isinstance(column.type, pa.BaseExtensionType) else column.type
-            )
+            first = pa.array([], _storage_type(column.type))
             if sample is not None and is_nested(column.type):
                 first = sample.column(column.name)
             node = plan(column.name, column.type, first, MAX_COLUMNS)
@@ -120,7 +118,11 @@ class ArrowColumns:
 
 def is_nested(kind: pa.DataType) -> bool:
     """Return whether a column holds lists or structures."""
-    return bool(pa.types.is_nested(kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind))
+    return bool(pa.types.is_nested(_storage_type(kind)))
+
+
+def _storage_type(kind: pa.DataType) -> pa.DataType:
+    return kind.storage_type if isinstance(kind, pa.BaseExtensionType) else kind
 
 
 class _Number:

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any, Literal, cast
+from typing import IO, Literal, cast
 
-from lipcore.extras import import_extra
 from service.datasets.formats.table import first_line, unreadable
-from service.datasets.formats.zips import COPY_BYTES, ERRORS, check_unpacked_size, open_zip
+from service.datasets.formats.zips import COPY_BYTES, ERRORS, check_unpacked_size, decompress, open_zip
 from service.foundation.errors import TooLargeError
 from service.foundation.settings import Settings
 
@@ -41,8 +40,7 @@ def _open(path: Path, compression: Compression, settings: Settings, stack: ExitS
             return stack.enter_context(archive.open(members[0]))
         except ERRORS as error:
             raise unreadable("file", first_line(error), "a complete zip archive") from None
-    pa: Any = import_extra("pyarrow", "ingest")
-    return cast(IO[bytes], pa.CompressedInputStream(stack.enter_context(path.open("rb")), compression))
+    return cast(IO[bytes], decompress(stack.enter_context(path.open("rb")), compression))
 
 
 def _read(source: IO[bytes], compression: str) -> bytes:

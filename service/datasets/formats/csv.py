@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -20,6 +21,7 @@ from service.datasets.formats.table import (
     clean_names,
     describe_unread,
     first_line,
+    name_columns,
     stack_blocks,
     unreadable,
 )
@@ -42,7 +44,7 @@ def open_csv(path: Path, options: ReadOptions, settings: Settings, naming: Namin
     without names, by default from `options.column_names`.
     """
     if naming is None and options.column_names is not None:
-        naming = _name_from_option(options.column_names)
+        naming = partial(name_columns, options.column_names)
     layout = read_layout(path, options.delimiter, naming)
     if layout.transposed:
         yield open_transposed(path, layout)
@@ -108,18 +110,6 @@ def _blocks(
         batch = next(batches, None)
     if any(isinstance(each, NumberCells) and each.commas for each in readers.values()):
         facts.append("numbers have decimal commas")
-
-
-def _name_from_option(names: tuple[str, ...]) -> Naming:
-    """Return the function that gives the names of the option `column_names`."""
-
-    def naming(width: int) -> tuple[str, ...]:
-        if len(names) != width:
-            expected = f"{width} names because the rows have {width} values"
-            raise invalid_data("column_names", f"{len(names)} names", expected)
-        return names
-
-    return naming
 
 
 def _read_batches(lines: TextLines, layout: TextLayout, width: int) -> Iterator[pa.RecordBatch]:

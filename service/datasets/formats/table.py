@@ -55,6 +55,14 @@ def clean_names(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(checked)
 
 
+def name_columns(names: Sequence[str], width: int) -> tuple[str, ...]:
+    """Return the names of the option `column_names`; raise InvalidDataError if there are not `width`."""
+    if len(names) != width:
+        expected = f"{width} names because the rows have {width} values"
+        raise invalid_data("column_names", f"{len(names)} names", expected)
+    return tuple(names)
+
+
 def stack_blocks(columns: Sequence[Array]) -> Iterator[Array]:
     """Yield columns of equal length (rows,) as blocks (≤ block_rows, columns)."""
     rows, step = len(columns[0]), block_rows(len(columns))

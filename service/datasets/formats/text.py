@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,15 +109,12 @@ def _find_dialect(lines: Sequence[str]) -> tuple[str, str]:
 def _split_records(lines: Sequence[str], delimiter: str, quote: str) -> list[Record]:
     """Return the rows and comments in some lines, without empty ones."""
     out: list[Record] = []
-    if delimiter == BLANK:
-        split = [([cell.strip(quote) for cell in line.split()], end) for end, line in enumerate(lines, start=1)]
-    else:
-        split, reader = [], csv.reader(lines, delimiter=delimiter, quotechar=quote)
-        try:
-            split.extend((cells, reader.line_num) for cells in reader)
-        except csv.Error as error:
-            if not split:
-                raise invalid_data("header", str(error), f"{EXPECTED}, at most {MAX_HEADER_CHARS} characters") from None
+    split: list[tuple[list[str], int]] = []
+    try:
+        split.extend(split_rows(lines, delimiter, quote))
+    except csv.Error as error:
+        if not split:
+            raise invalid_data("header", str(error), f"{EXPECTED}, at most {MAX_HEADER_CHARS} characters") from None
     begin = 0
     for cells, end in split:  # damage below is reported by the reader of the rows
         if any(map(str.strip, cells)):
@@ -130,6 +127,16 @@ def _split_records(lines: Sequence[str], delimiter: str, quote: str) -> list[Rec
     if not out:
         raise invalid_data("header", "empty", EXPECTED)
     return out
+
+
+def split_rows(lines: Iterable[str], delimiter: str, quote: str) -> Iterator[tuple[list[str], int]]:
+    """Yield the cells of each row, and the number of lines until its end; raise csv.Error."""
+    if delimiter == BLANK:
+        yield from (([cell.strip(quote) for cell in line.split()], end) for end, line in enumerate(lines, start=1))
+        return
+    reader = csv.reader(lines, delimiter=delimiter, quotechar=quote)
+    for cells in reader:
+        yield cells, reader.line_num
 
 
 def _parse_delimiter(delimiter: str) -> str:

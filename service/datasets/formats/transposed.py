@@ -9,8 +9,8 @@ from pathlib import Path
 import pyarrow as pa
 
 from service.datasets.formats.cells import NumberCells
-from service.datasets.formats.table import MAX_COLUMNS, Table, clean_names, stack_blocks
-from service.datasets.formats.text import BLANK, TextLayout
+from service.datasets.formats.table import MAX_COLUMNS, Table, clean_names, stack_blocks, unreadable
+from service.datasets.formats.text import TextLayout, split_rows
 from service.foundation.errors import TooLargeError, invalid_data
 
 MAX_BYTES = 64 * 1024 * 1024
@@ -25,11 +25,10 @@ def open_transposed(path: Path, layout: TextLayout) -> Table:
         )
     with path.open(encoding=layout.encoding, newline="") as file:
         lines = islice(file, layout.header.lines, layout.header.lines + MAX_COLUMNS + 1)
-        if layout.delimiter == BLANK:
-            rows = [line.split() for line in lines]
-        else:
-            rows = list(csv.reader(lines, delimiter=layout.delimiter, quotechar=layout.quote))
-    rows = [cells for cells in rows if cells]
+        try:
+            rows = [cells for cells, _ in split_rows(lines, layout.delimiter, layout.quote) if cells]
+        except csv.Error as error:
+            raise unreadable("file", str(error), "rows of a name and its numbers") from None
     names = clean_names([cells[0] for cells in rows])
     for name, cells in zip(names, rows, strict=True):
         if len(cells) != len(rows[0]):

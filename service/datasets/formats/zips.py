@@ -117,7 +117,7 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> list[
         file = folder / f"{index}.bag"
         packed = member.filename.endswith(".zstd")
         with archive.open(member) as source, file.open("xb") as target:
-            stream = _decompress(source) if packed else source
+            stream = decompress(source, "zstd") if packed else source
             while piece := stream.read(COPY_BYTES):
                 room -= len(piece)
                 if room < 0:
@@ -127,9 +127,10 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> list[
     return files
 
 
-def _decompress(source: IO[bytes]) -> Any:
+def decompress(source: IO[bytes], compression: str) -> Any:
+    """Return a file of the content of one that is compressed with gzip or zstd."""
     pa = import_extra("pyarrow", "ingest")
-    return pa.CompressedInputStream(pa.PythonFile(source, "r"), "zstd")
+    return pa.CompressedInputStream(pa.PythonFile(source, "r"), compression)
 
 
 def _bag_members(archive: zipfile.ZipFile, settings: Settings) -> list[zipfile.ZipInfo]:
