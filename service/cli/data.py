@@ -54,7 +54,7 @@ def add(
         ),
     ] = None,
     unit: Annotated[list[str] | None, typer.Option(help="Unit of a quantity, e.g. q=deg or t=ms. Repeatable.")] = None,
-    topic: Annotated[str | None, typer.Option(help="Topic of a bag, HDF5 group or sheet to read.")] = None,
+    topic: Annotated[str | None, typer.Option(help="Topics of a bag, HDF5 group or sheet to read.")] = None,
     delimiter: Annotated[str | None, typer.Option(help="Delimiter of a CSV file.")] = None,
     column_names: Annotated[
         str | None,

@@ -95,7 +95,8 @@ class UploadQuery(BaseModel):
     topic: str | None = Field(
         None,
         max_length=200,
-        description="Topic of a bag, HDF5 group, or sheet of a workbook, if several can be read",
+        description="Topic of a bag, HDF5 group, or sheet of a workbook, if several can be read. Topics separated by "
+        "commas are merged by time",
     )
     delimiter: str | None = Field(
         None, min_length=1, max_length=1, description="Delimiter of a CSV; detected by default"

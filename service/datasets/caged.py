@@ -21,7 +21,8 @@ from service.storage.disk import DiskBudget, Usage
 def warm() -> None:
     """Import all readers before processes are forked; raise MissingExtraError if they are not installed."""
     sys.meta_path.insert(0, _WithoutPandas)
-    for name in ("numpy.ma", "encodings.utf_8_sig", "dateutil.relativedelta"):
+    types = ("rosbags.typesys.stores.ros1_noetic", "rosbags.typesys.stores.ros2_humble")
+    for name in ("numpy.ma", "encodings.utf_8_sig", "dateutil.relativedelta", *types):
         with suppress(ImportError):
             import_module(name)
     import_extra("pyarrow", "ingest")

@@ -26,6 +26,7 @@ from lipcore.files.manifest import MANIFEST, TENSORS
 from service.models.archive_reading import EXPORT, FORMAT, FORMAT_VERSION
 from tests.fuzz.targets import JOINTS
 from tests.service.datasets import bag_writers as bags
+from tests.service.datasets import test_bag_messages as messages
 from tests.service.datasets.reading import parquet, zipped
 from tests.service.models.archives.packing import pack, with_checksums
 
@@ -75,6 +76,8 @@ def seeds() -> Iterator[tuple[str, bytes]]:
         yield "zip", bags.zipped(folder / "two", folder / "two.zip").read_bytes()
         for compression in ("NONE", "ZSTD"):
             yield "mcap", bags.write_mcap(folder / f"{compression}.mcap", written, compression).read_bytes()
+        for write in (messages.write_json, messages.write_protobuf):
+            yield "mcap", write(folder / f"{write.__name__}.mcap", messages.NUMBERS[:12]).read_bytes()
     texts = {"positions.txt": _text("q"), "velocities.txt": _text("dq"), "torques.txt": _text("tau")}
     yield "zip", zipped(texts, zipfile.ZIP_STORED)
     yield "zip", _lerobot()

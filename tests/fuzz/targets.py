@@ -14,11 +14,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
 
+from mcap import data_stream, stream_reader
+
 from lipcore.files.manifest import DEFAULT_LIMITS, ModelFormatError, read_manifest_bytes
 from lipcore.files.tensors import read_tensors
 from lipcore.profiles import from_urdf
 from service.datasets.caged import read_upload
-from service.datasets.formats.bags import files
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
 from service.foundation.errors import ServiceError
@@ -36,8 +37,7 @@ SMALL = {
     "formats.npz.MAX_COLUMNS": 200,
     **{f"formats.{name}.MAX_COLUMNS": 200 for name in ("arrow", "csv", "transposed", "workbook")},
     "formats.zips.MAX_MEMBERS": 50,
-    "formats.bags.container.MAX_PART_BYTES": 4 * MiB,
-    "formats.bags.files.MAX_PART_BYTES": 4 * MiB,
+    "formats.bags.decoding.MAX_SEQUENCE": 5000,
     "formats.json.MAX_BYTES": MiB,
     "formats.json.MAX_LINE_BYTES": 64 * 1024,
     "formats.opening.MAX_LINE_BYTES": 64 * 1024,
@@ -57,7 +57,7 @@ class _Sum(int):
         return False
 
 
-_without_sums = patch.object(files, "zlib", SimpleNamespace(crc32=lambda data: _Sum()))
+_NO_SUMS = SimpleNamespace(crc32=lambda *_: _Sum())
 
 
 def _recording(kind: str) -> Callable[[bytes], None]:
@@ -67,7 +67,9 @@ def _recording(kind: str) -> Callable[[bytes], None]:
         with tempfile.TemporaryDirectory() as folder, patch.object(zipfile.ZipExtFile, "_update_crc", lambda *_: None):
             path = Path(folder) / "upload"
             path.write_bytes(data)
-            with _without_sums, patch("chardet.detect", return_value=NOT_SURE), ExitStack() as small:
+            with patch("chardet.detect", return_value=NOT_SURE), ExitStack() as small:
+                for module in (stream_reader, data_stream):
+                    small.enter_context(patch.object(module, "zlib", _NO_SUMS))
                 for place, value in SMALL.items():
                     small.enter_context(patch(f"service.datasets.{place}", value))
                 read_upload(path, kind, UploadOptions(), None, USAGE, Path(folder), SETTINGS)

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -222,9 +221,7 @@ def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> Ab
         return own[kind](path, options, settings)
     import_extra("pyarrow", "ingest")  # the readers below need it
     module = {"hdf5": "arrays", "mat": "arrays", "npy": "arrays", "xlsx": "workbook"}.get(kind, kind)
-    if kind not in ("rosbag1", "rosbag2", "mcap"):
-        opener: Opener = getattr(import_extra(f"service.datasets.formats.{module}", "ingest"), f"open_{kind}")
-        return opener(path, options, settings)
-    from service.datasets.formats.bags.reading import BagKind, open_bag  # noqa: PLC0415
-
-    return open_bag(path, cast(BagKind, kind), options, settings)
+    if kind in ("rosbag1", "rosbag2", "mcap"):
+        module, kind = "bags.reading", "bag"
+    opener: Opener = getattr(import_extra(f"service.datasets.formats.{module}", "ingest"), f"open_{kind}")
+    return opener(path, options, settings)

@@ -81,8 +81,8 @@ PHRASES: dict[tuple[str, ...], tuple[str, str]] = {
     ("observation", "state"): ("q", "position"),
 }
 MEASURED = frozenset(("actual", "act", "measured", "meas", "feedback", "fb", "present", "real", "sensor", "observed"))
-COMMANDED = frozenset(
-    ("target", "desired", "des", "commanded", "command", "cmd", "reference", "ref", "setpoint", "goal", "action")
+COMMANDED = frozenset(("desired", "des", "commanded", "cmd", "cmds", "ref", "action")) | frozenset(
+    word + plural for word in ("target", "command", "reference", "setpoint", "goal") for plural in ("", "s")
 )
 NEUTRAL = frozenset(("joint", "joints", "jnt", "j", "axis", "motor", "filtered", "raw", "state", "value", "link"))
 OTHER_QUANTITIES = (

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.datasets.formats.bags.reading import BagKind, open_bag
+from service.datasets.formats.bags.reading import open_bag
 from service.datasets.options import ReadOptions
 from service.foundation.settings import Settings
 from tests.service.datasets.reading import Read, read_blocks
@@ -157,9 +157,9 @@ def bare(folder: Path, file: Path) -> Path:
     return file
 
 
-def read(path: Path, kind: BagKind, options: ReadOptions | None = None, settings: Settings = SETTINGS) -> Read:
+def read(path: Path, options: ReadOptions | None = None, settings: Settings = SETTINGS) -> Read:
     """Read the whole table of a bag."""
-    with open_bag(path, kind, options or ReadOptions(), settings) as table:
+    with open_bag(path, options or ReadOptions(), settings) as table:
         return read_blocks(table)
 
 

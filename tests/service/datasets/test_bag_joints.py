@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.datasets.formats.bags.states import MessageKind, choose_joints, has_joints
+from service.datasets.formats.bags.joints import MessageKind, choose_joints, has_joints
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings
@@ -19,12 +19,12 @@ def shuffled(state: State, order: list[int]) -> State:
     return State(state.stamp, [state.names[k] for k in order], **parts)
 
 
-@pytest.mark.parametrize(("write", "kind"), [(write_mcap, "mcap"), (bags.write_rosbag1, "rosbag1")])
-def test_joint_order_may_change_between_messages(tmp_path, write, kind):
+@pytest.mark.parametrize("write", [write_mcap, bags.write_rosbag1])
+def test_joint_order_may_change_between_messages(tmp_path, write):
     recorded = states(200, ("a", "b", "c", "d"))
     generator = np.random.default_rng(1)
     mixed = [recorded[0], *(shuffled(each, generator.permutation(4).tolist()) for each in recorded[1:])]
-    result = read(write(tmp_path / "bag", mixed), kind)
+    result = read(write(tmp_path / "bag", mixed))
     assert sorted(result.joint_names) == ["a", "b", "c", "d"]
     ordered = [shuffled(each, ["abcd".index(name) for name in result.joint_names]) for each in recorded]
     np.testing.assert_array_equal(result.rows, table_of(ordered))
@@ -35,17 +35,17 @@ def test_arm_is_read_beside_a_gripper_on_the_same_topic(tmp_path):
     arm = states(100)
     gripper = [State(each.stamp + k * 1000 + 1, ("finger",), [1.0], [0.0]) for each in arm for k in range(3)]
     path = write_mcap(tmp_path / "a.mcap", sorted(arm + gripper, key=lambda each: each.stamp))
-    result = read(path, "mcap")
+    result = read(path)
     np.testing.assert_array_equal(result.rows, table_of(arm))
     others = "300 of 400 messages do not have all joints and were not read; other joints of the topic: finger"
     assert others in result.facts
     with pytest.raises(InvalidDataError, match="no effort: it is empty in all messages"):
-        read(path, "mcap", ReadOptions(joint_names=("finger",)))
+        read(path, ReadOptions(joint_names=("finger",)))
 
 
 def test_joint_names_choose_joints_and_their_order(tmp_path):
     recorded = states(50)
-    result = read(write_mcap(tmp_path / "a.mcap", recorded), "mcap", ReadOptions(joint_names=("c", "a")))
+    result = read(write_mcap(tmp_path / "a.mcap", recorded), ReadOptions(joint_names=("c", "a")))
     assert result.joint_names == ("c", "a")
     np.testing.assert_array_equal(result["c/effort"], [each.effort[2] for each in recorded])
     assert "joints not read: b" in result.facts
@@ -54,8 +54,8 @@ def test_joint_names_choose_joints_and_their_order(tmp_path):
 def test_joints_without_names_are_numbered_or_given_names(tmp_path):
     recorded = altered(states(50), names=())
     path = write_mcap(tmp_path / "a.mcap", recorded)
-    assert read(path, "mcap").joint_names == ("joint1", "joint2", "joint3")
-    result = read(path, "mcap", ReadOptions(joint_names=("x", "y", "z")))
+    assert read(path).joint_names == ("joint1", "joint2", "joint3")
+    result = read(path, ReadOptions(joint_names=("x", "y", "z")))
     assert result.names[1:4] == ("x/position", "y/position", "z/position")
     np.testing.assert_array_equal(result.rows, table_of(recorded))
 
@@ -76,7 +76,7 @@ OUT_OF = "joint_names is a, x, expected joints out of a, b, c that are in the sa
         ),
         (SIXTH, {"names": ("a", "b")}, None, {}, "message 6 is a state with 3 values of position, expected 2, one per"),
         (SIXTH, {"velocity": [1.0]}, None, {}, "message 6 is a state with 1 values of velocity, expected 3, one per"),
-        (ALL, {"position": (), "velocity": ()}, None, {}, "without positions"),
+        (ALL, {"position": (), "velocity": ()}, None, {}, "no positions"),
         (ALL, {"names": ()}, ("x", "y"), {}, "joint_names is x, y, expected 3 names"),
         (ALL, {}, ("a", "x"), {}, OUT_OF),
         (ALL, {}, None, {"max_joints": 2}, "3 joints, expected at most 2"),
@@ -86,7 +86,7 @@ OUT_OF = "joint_names is a, x, expected joints out of a, b, c that are in the sa
 def test_unusable_messages_and_names_are_rejected(tmp_path, rows, values, names, limits, message):
     path = write_mcap(tmp_path / "a.mcap", altered(states(50), rows, **values))
     with pytest.raises(InvalidDataError, match=message):
-        read(path, "mcap", ReadOptions(joint_names=names), Settings(**limits))
+        read(path, ReadOptions(joint_names=names), Settings(**limits))
 
 
 kinds = st.builds(

@@ -1,264 +1,224 @@
-"""Reading a bag of any kind as a table.
-
-The topic with joint states is chosen. Its messages are read twice: first to find what they hold, then for the numbers.
-"""
+"""Reading a bag as a table: the topics with joint states are chosen, and several topics are merged by time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from service.datasets.formats.bags import files
-from service.datasets.formats.bags.container import Bag, Channel, JoinedBags
-from service.datasets.formats.bags.states import (
-    ENCODINGS,
-    MAX_KINDS,
-    STATE_TYPES,
-    Decoder,
-    MessageForm,
-    MessageKind,
-    choose_joints,
-    describe_choice,
-    has_joints,
-)
-from service.datasets.formats.table import BLOCK_ROWS, Table, clean_names
+from service.datasets.formats.bags.containers import Topic, read_messages
+from service.datasets.formats.bags.decoding import ENCODINGS, make_decoder
+from service.datasets.formats.bags.fields import find_fields
+from service.datasets.formats.bags.source import NS, Samples, Source
+from service.datasets.formats.table import Table, clean_names, first_line, stack_blocks, unreadable
 from service.datasets.formats.zips import unpack_bag
 from service.datasets.options import ReadOptions
-from service.foundation.errors import InvalidDataError, invalid_data, invalid_request, readable
+from service.foundation.errors import ServiceError, invalid_data, invalid_request, readable
 from service.foundation.settings import Settings
-from service.foundation.text import counted
 
-BagKind = Literal["rosbag1", "rosbag2", "mcap"]
-KINDS = {"rosbag1": "a ROS 1 bag", "rosbag2": "a ROS 2 bag: a .db3 file or a zip of its folder", "mcap": "an MCAP file"}
-QUANTITIES = ("position", "velocity", "acceleration", "effort")
-BATCH_BYTES = 4 * 1024 * 1024
-"""Max bytes of messages in a batch. Their copies and the block need several times this."""
-NS = 1_000_000_000
-
-
-@dataclass
-class _Batch:
-    """Consecutive messages: reception times in ns, and by form the row numbers and bytes."""
-
-    received: list[int] = field(default_factory=list)
-    rows: dict[int, tuple[MessageForm, list[int], list[bytes]]] = field(default_factory=dict)
-
-    def groups(self) -> Iterator[tuple[MessageForm, NDArray[np.int64], NDArray[np.uint8]]]:
-        """Yield the form, row numbers (M,) and data (M, bytes) of the messages of each form."""
-        for form, rows, data in self.rows.values():
-            yield form, np.array(rows), np.frombuffer(b"".join(data), np.uint8).reshape(len(rows), -1)
+JOINT_STATE = "sensor_msgs/JointState"
+PROBED = 20
+"""Max messages of a topic from which its fields are found."""
+MAX_PROBED_BYTES = 256 * 1024
+"""Max size of a message with joint states. Larger ones are images and point clouds."""
+MAX_GAP_STEPS = 5.0
+"""Max distance of two messages between which numbers are interpolated, in median distances."""
+QUANTITIES = ("q", "dq", "ddq", "tau")
 
 
 @dataclass
-class _Survey:
-    """The kinds of messages, and for each message the index of its kind, its stamp and its reception time in ns."""
+class Bag:
+    """The files of a recording, in order."""
 
-    kinds: list[MessageKind]
-    kind: NDArray[np.int32]
-    stamps: NDArray[np.int64]
-    received: NDArray[np.int64]
+    files: Sequence[Path]
+    facts: list[str] = field(default_factory=list)
 
-
-def read_channel(bag: Bag, channel: Channel, joint_names: tuple[str, ...] | None, settings: Settings) -> Table:
-    """Return the table of a channel; raise InvalidDataError. joint_names: joints to read; None chooses them."""
-    survey = _survey(bag, channel, settings)
-    counts = np.bincount(survey.kind, minlength=len(survey.kinds)).tolist()
-    named = any(kind.named for kind in survey.kinds)
-    joints = names = choose_joints(survey.kinds, counts, joint_names if named else None, channel.topic)
-    if joint_names is not None and not named:
-        if len(joint_names) != len(joints):
-            raise invalid_data("joint_names", ", ".join(joint_names), f"{len(joints)} names, one per joint")
-        names = joint_names
-    if len(joints) > settings.max_joints:
-        raise _topic_error(channel, f"{len(joints)} joints", f"at most {settings.max_joints}")
-    kept_kinds = np.array([has_joints(kind, joints) for kind in survey.kinds])
-    kept = kept_kinds[survey.kind]
-    holding = {
-        each: sum(
-            c for k, c in zip(survey.kinds, counts, strict=True) if has_joints(k, joints) and each in k.quantities
-        )
-        for each in QUANTITIES
-    }
-    quantities = tuple(each for each in QUANTITIES if holding[each])
-    if "effort" not in quantities:
-        raise _topic_error(channel, "no effort: it is empty in all messages", "the torque of each joint")
-    use_stamps, times_of = _choose_clock(survey.stamps[kept], survey.received[kept])
-    times = survey.stamps if use_stamps else survey.received
-    start = int(times[np.argmax(kept)])
-    facts = [
-        *bag.facts,
-        f"topic {channel.topic}: {counted(len(kept), 'message')} of type {channel.type}",
-        *describe_choice(survey.kinds, counts, joints, holding),
-        f"times are {times_of}, counted from {start // NS}.{start % NS:09d} s",
-    ]
-    units = Decoder(channel).source.units
-    return Table(
-        names=clean_names(("t", *(f"{joint}/{quantity}" for quantity in quantities for joint in names))),
-        blocks=_blocks(bag, channel, joints, quantities, use_stamps, start),
-        joint_names=names,
-        units={"t": "s"}
-        | {f"{joint}/{quantity}": units[quantity] for quantity in quantities if quantity in units for joint in names},
-        facts=facts,
-    )
-
-
-def _batches(bag: Bag, channel: Channel) -> Iterator[_Batch]:
-    decoder = Decoder(channel)
-    batch, size = _Batch(), 0
-    for number, (time, data) in enumerate(bag.messages(channel), 1):
-        form = decoder.find_form(data, number)
-        _, rows, known = batch.rows.setdefault(id(form), (form, [], []))
-        rows.append(len(batch.received))
-        known.append(data)
-        batch.received.append(time)
-        size += len(data)
-        if len(batch.received) == BLOCK_ROWS or size > BATCH_BYTES:
-            yield batch
-            batch, size = _Batch(), 0
-    if batch.received:
-        yield batch
-
-
-def _survey(bag: Bag, channel: Channel, settings: Settings) -> _Survey:
-    numbers: dict[MessageKind, int] = {}
-    parts: list[tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int64]]] = []
-    total = 0
-    for batch in _batches(bag, channel):
-        kind, stamps = np.zeros(len(batch.received), np.int32), np.zeros(len(batch.received), np.int64)
-        for form, rows, data in batch.groups():
-            kind[rows] = numbers.setdefault(form.kind, len(numbers))
-            stamps[rows] = form.stamps(data)
-        parts.append((kind, stamps, np.array(batch.received, np.int64)))
-        total += len(kind)
-        if total > settings.max_samples:
-            raise _topic_error(channel, f"more than {settings.max_samples} messages", f"at most {settings.max_samples}")
-        if len(numbers) > MAX_KINDS:
-            raise _topic_error(channel, f"more than {MAX_KINDS} sets of joints", f"at most {MAX_KINDS}")
-    if not parts:
-        raise _topic_error(channel, "no messages", "at least one")
-    return _Survey(list(numbers), *(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _choose_clock(stamps: NDArray[np.int64], received: NDArray[np.int64]) -> tuple[bool, str]:
-    """Return whether header stamps are used as times, and words for the report on the times."""
-    steps, unset = np.diff(stamps), int((stamps == 0).sum())
-    # stamps of a simulation start at 0 and stay below three years
-    if unset and not 0 < stamps.max() < 10**8 * NS:
-        return False, f"reception times because {unset} of {len(stamps)} header stamps are not set"
-    if back := int((steps < 0).sum()):
-        first = int(np.argmax(steps < 0)) + 2
-        return False, f"reception times because header stamps go back {counted(back, 'time')}, first in row {first}"
-    if len(stamps) > 1 and 2 * int((steps > 0).sum()) < len(steps):
-        return False, "reception times because most header stamps repeat the one before"
-    return True, "header stamps"
-
-
-def _blocks(
-    bag: Bag, channel: Channel, joints: tuple[str, ...], quantities: tuple[str, ...], use_stamps: bool, start: int
-) -> Iterator[Array]:
-    n = len(joints)
-    for batch in _batches(bag, channel):
-        block = np.full((len(batch.received), 1 + n * len(quantities)), np.nan)
-        kept = np.zeros(len(block), bool)
-        received = np.array(batch.received, np.int64)
-        for form, rows, data in batch.groups():
-            if not has_joints(form.kind, joints):
-                continue
-            kept[rows] = True
-            # subtract integers: seconds since 1970 as floats have a resolution of 0.2 µs
-            block[rows, 0] = ((form.stamps(data) if use_stamps else received[rows]) - start) / NS
-            order = [form.kind.joints.index(joint) for joint in joints]
-            for index, quantity in enumerate(quantities):
-                if quantity in form.kind.quantities:
-                    block[rows, 1 + index * n : 1 + (index + 1) * n] = form.values(data, quantity)[:, order]
-        if kept.any():
-            yield block[kept]
+    def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
+        """Yield the topic, reception time in ns and data of all messages."""
+        for file in self.files:
+            yield from read_messages(file, self.facts)
 
 
 @contextmanager
-def open_bag(path: Path, kind: BagKind, options: ReadOptions, settings: Settings) -> Iterator[Table]:
-    """Open the joint states of a bag as a table with columns `t` in s and `<joint>/position`, `/velocity`, `/effort`.
+def open_bag(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
+    """Open a bag, or the zip of a bag's folder, as a table with columns such as `t` and `<joint>/position`.
 
-    kind: `rosbag2` is a sqlite3 file, or the zip of a folder of sqlite3 or MCAP files. Raise InvalidDataError,
-    InvalidRequestError if the topic is wrong, or TooLargeError.
+    Raise InvalidDataError, InvalidRequestError if the topic is wrong, or TooLargeError.
     """
     with ExitStack() as stack:
         with path.open("rb") as file:
             zipped = file.read(4) == b"PK\x03\x04"
-        if zipped:
-            files = stack.enter_context(unpack_bag(path, settings))
-            bag: Bag = JoinedBags(path, [_open(each, "rosbag2", settings) for each in files], settings)
-        else:
-            bag = _open(path, kind, settings)
-        channel = _choose_channel(bag.channels(), options.topic, bag)
-        yield read_channel(bag, channel, options.joint_names, settings)
+        bag = Bag(stack.enter_context(unpack_bag(path, settings)) if zipped else [path])
+        sources, chosen = _choose_sources(bag, options.topic)
+        by_topic = {each.topic: each for each in sources}
+        for topic, received, data in bag.messages():
+            if topic in by_topic:
+                by_topic[topic].collect(received, data, settings)
+        samples = [sources[0].arrange(options.joint_names, settings)]
+        samples += [each.arrange(samples[0].joints, settings) for each in sources[1:]]
+        yield _table(sources, samples, [*bag.facts, *chosen])
 
 
-def _open(path: Path, kind: str, settings: Settings) -> Bag:
-    with path.open("rb") as file:
-        start = file.read(16)
-    if start.startswith(files.MCAP_MAGIC):
-        return files.Mcap(path, settings)
-    if start.startswith(files.ROSBAG1_MAGIC):
-        return files.Rosbag1(path, settings)
-    if start.startswith(files.SQLITE_MAGIC):
-        return files.SqliteBag(path, settings)
-    if not start:
-        raise invalid_data("file", "empty", KINDS[kind])
-    raise invalid_data("file", f"not a bag (it begins with {start!r})", KINDS[kind])
+def _table(sources: Sequence[Source], samples: Sequence[Samples], facts: list[str]) -> Table:
+    joints = samples[0].joints
+    of = {quantity: place for place, each in enumerate(samples) for quantity in each.values}
+    if "tau" not in of:
+        raise sources[0].error("no effort: it is empty in all messages", "the torque of each joint")
+    if "q" not in of:
+        raise sources[0].error("no positions", "the position of each joint")
+    times, values = _merge(samples)
+    start = int(times[0])
+    facts += [fact for each in samples for fact in each.facts]
+    facts.append(f"times count from {start // NS}.{start % NS:09d} s")
+    names, columns, units = ["t"], [(times - start) / NS], {"t": "s"}
+    for quantity in [each for each in QUANTITIES if each in of]:
+        read = sources[of[quantity]].fields
+        for j, joint in enumerate(joints):
+            names.append(f"{joint}/{read.quantities[quantity].column}")
+            columns.append(values[quantity][:, j])
+            if quantity in read.units:
+                units[names[-1]] = read.units[quantity]
+    return Table(clean_names(names), stack_blocks(columns), joints, units, facts)
 
 
-def _choose_channel(channels: dict[Channel, int], topic: str | None, bag: Bag) -> Channel:
-    """Return the channel to read. channels: number of messages of each."""
-    if not channels:
+def _merge(samples: Sequence[Samples]) -> tuple[NDArray[np.int64], dict[str, Array]]:
+    """Return the times of the topic with the fewest messages, and all numbers at these times.
+
+    Numbers of other topics are interpolated, NaN if their neighbours are far apart.
+    """
+    if len(samples) == 1:
+        return samples[0].times, dict(samples[0].values)
+    slowest = min(samples, key=lambda each: len(each.times))
+    begin, end = max(each.times.min() for each in samples), min(each.times.max() for each in samples)
+    times = np.sort(slowest.times[(slowest.times >= begin) & (slowest.times <= end)])
+    if not len(times):
+        raise invalid_data("topic", "topics that were recorded at different times", "topics of the same time")
+    values = {}
+    for each in samples:
+        order = np.argsort(each.times, kind="stable")
+        known = (each.times[order] - times[0]).astype(float)
+        at = (times - times[0]).astype(float)
+        right = np.clip(np.searchsorted(known, at), 1, max(len(known) - 1, 1))
+        gaps = np.diff(known, append=known[-1])
+        far = (gaps[right - 1] > MAX_GAP_STEPS * np.median(gaps[:-1])) & ~np.isin(at, known)
+        for quantity, numbers in each.values.items():
+            columns = [np.interp(at, known, column[order]) for column in numbers.T]
+            values[quantity] = np.where(far[:, None], np.nan, np.column_stack(columns))
+    return times, values
+
+
+def _choose_sources(bag: Bag, given: str | None) -> tuple[list[Source], list[str]]:
+    """Return the topics to read, the one with positions first, and sentences about the choice."""
+    counts, probed = Counter[Topic](), defaultdict[Topic, list[bytes]](list)
+    for topic, _, data in bag.messages():
+        counts[topic] += 1
+        if len(probed[topic]) < PROBED and len(data) <= MAX_PROBED_BYTES and topic.encoding in ENCODINGS:
+            probed[topic].append(bytes(data))
+    if not counts:
         message = "; ".join(["The bag has no messages", *bag.facts])
         raise invalid_data("file", "a bag without messages", "joint states", message)
-    known = {each: count for each, count in channels.items() if each.type in STATE_TYPES and each.encoding in ENCODINGS}
-    # messages of several publishers of a topic are read together
-    by_name = {(each.topic, each.type): each for each in reversed(known)}
-    if topic is not None:
-        candidates = [each for each in by_name.values() if each.topic == topic]
-        if not candidates and any(each.topic == topic for each in channels):
-            other = next(each for each in channels if each.topic == topic)
-            raise invalid_request("topic", f"{topic} of type {other.type} ({other.encoding})", _expected_topic())
-        if not candidates:
-            raise invalid_request("topic", topic, f"one of {_listed(known or channels)}")
+    sources, failed = _find_sources(probed)
+    if given is not None:
+        return _take([_named(name.strip(), sources, failed, counts) for name in given.split(",")]), []
+    if not sources and failed:
+        raise next(iter(failed.values()))
+    if not sources:
+        raise invalid_data("file", f"a bag of the topics {_listed(counts)}", _EXPECTED)
+    return _choose(sources, counts)
+
+
+def _find_sources(probed: dict[Topic, list[bytes]]) -> tuple[list[Source], dict[str, ServiceError]]:
+    """Return the topics with numbers of joints, and the errors of topics that cannot be read by name."""
+    sources, failed = [], {}
+    for topic, messages in probed.items():
+        decoded, reason = [], ""
+        try:
+            decode = make_decoder(topic)
+        except ServiceError as error:
+            failed[topic.name] = error
+            continue
+        for data in messages:
+            try:
+                decoded.append(decode(data))
+            except Exception as error:  # of the decoders, for damaged messages
+                reason = reason or first_line(error)
+        fields = find_fields(topic, decoded) if decoded else None
+        if fields is not None:
+            read = tuple(each for each in QUANTITIES if each in fields.quantities)
+            sources.append(Source(topic, decode, fields, read))
+        elif reason:
+            failed[topic.name] = unreadable(f"topic {topic.name}", reason, f"messages of type {topic.type}")
+    return sources, failed
+
+
+def _named(name: str, sources: list[Source], failed: dict[str, ServiceError], counts: Counter[Topic]) -> Source:
+    for source in sources:
+        if source.topic.name == name:
+            return source
+    if name in failed:
+        raise failed[name]
+    for topic in counts:
+        if topic.name == name:
+            raise invalid_request("topic", f"{name} of type {topic.type} ({topic.encoding})", _EXPECTED)
+    known = Counter({each.topic: counts[each.topic] for each in sources}) or counts
+    raise invalid_request("topic", name, f"one of {_listed(known)}")
+
+
+def _choose(sources: list[Source], counts: Counter[Topic]) -> tuple[list[Source], list[str]]:
+    """Choose the topics, measured before commanded; raise InvalidDataError if several fit."""
+    measured = [each for each in sources if not each.fields.commanded] or sources
+    positions, torques = ([each for each in measured if quantity in each.quantities] for quantity in ("q", "tau"))
+    both = [each for each in positions if each in torques]
+    states = [each for each in both if each.topic.type == JOINT_STATE]
+    if len(states) == 1 or len(both) == 1:
+        chosen = states if len(states) == 1 else both
+    elif not both and len(positions) <= 1 and len(torques) <= 1 and positions + torques:
+        package = (positions + torques)[0].topic.type.partition("/")[0]
+        speeds = [
+            each for each in measured if each not in [*positions, *torques] and each.topic.type.startswith(package)
+        ]
+        chosen = _take([*positions, *torques, *(speeds if len(speeds) == 1 else [])])
+    elif not positions and not torques:
+        raise invalid_data("file", f"a bag of the topics {_listed(counts)}", _EXPECTED)
     else:
-        candidates = list(by_name.values())
-        if not candidates:
-            raise invalid_data("file", f"a bag of the topics {_listed(channels)}", _expected_topic())
-    if len(candidates) > 1:
-        raise _ambiguous(known)
-    return candidates[0]
+        several = both or [*positions, *torques]
+        listed = _listed(Counter({each.topic: counts[each.topic] for each in several}))
+        example = (
+            several[0].topic.name if both else ",".join(each[0].topic.name for each in (positions, torques) if each)
+        )
+        remedy = f"Set `topic`, because the bag has several: {listed}. For example topic={example}"
+        raise invalid_data("topic", "missing", f"one of {listed}", remedy)
+    facts = ["the topics are merged by time"] if len(chosen) > 1 else []
+    if left := [readable(each.topic.name[:100]) for each in sources if each not in chosen]:
+        facts.append(f"topics not read: {', '.join(left[:20])}")
+    return chosen, facts
 
 
-def _ambiguous(known: dict[Channel, int]) -> InvalidDataError:
-    listed = _listed(known)
-    return invalid_data("topic", "missing", f"one of {listed}", f"Set `topic`, because the bag has several: {listed}")
+def _take(sources: list[Source]) -> list[Source]:
+    """Return the sources with each quantity read from the first topic that has it, the one with positions first."""
+    sources = sorted(sources, key=lambda each: "q" not in each.quantities)
+    taken: set[str] = set()
+    for each in sources:
+        each.quantities = tuple(quantity for quantity in each.quantities if quantity not in taken)
+        taken |= set(each.quantities)
+    return [each for each in sources if each.quantities]
 
 
-def _topic_error(channel: Channel, value: str, expected: str) -> InvalidDataError:
-    topic = f"topic {channel.topic}"
-    return invalid_data(topic, value, expected, f"{readable(topic[:200])} has {value}, expected {expected}")
+_EXPECTED = "a topic with a position and a torque of each joint, such as one of type sensor_msgs/JointState"
 
 
-def _expected_topic() -> str:
-    return f"a topic of type {', '.join(STATE_TYPES)} in CDR or ROS 1 encoding"
-
-
-def _listed(channels: dict[Channel, int]) -> str:
-    counts: dict[tuple[str, str], int] = {}
-    for each, count in channels.items():
-        counts[each.topic, each.type] = counts.get((each.topic, each.type), 0) + count
+def _listed(counts: Counter[Topic]) -> str:
+    totals = Counter[tuple[str, str]]()
+    for each, count in counts.items():
+        totals[each.name, each.type] += count
     listed = [
-        f"{readable(topic[:100])} ({readable(name[:100])}, {count} messages)"
-        for (topic, name), count in list(counts.items())[:20]
+        f"{readable(name[:100])} ({readable(kind[:100])}, {count} messages)"
+        for (name, kind), count in list(totals.items())[:20]
     ]
-    return ", ".join(listed) + (f" and {len(counts) - 20} more" if len(counts) > 20 else "")
+    return ", ".join(listed) + (f" and {len(totals) - 20} more" if len(totals) > 20 else "")

@@ -106,7 +106,7 @@ export function uploadOptions() {
       field("Min gap, in median time steps", inputs.gap),
       field("Trim at both ends, s", inputs.trim),
       field("Torque convention", inputs.torque_convention),
-      field("Topic", inputs.topic, "Required if several topics of a bag can be read."),
+      field("Topic", inputs.topic, "Required if several topics of a bag can be read. Topics separated by commas are merged by time."),
       field("Delimiter", inputs.delimiter, "For CSV files."),
     ),
   );
