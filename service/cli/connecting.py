@@ -172,24 +172,10 @@ def _noted(path: Path, dataset: Dataset) -> str:
 
 
 def _made_of(client: Client, path: Path) -> Dataset | None:
-    """Return the data set that was made from a file earlier, or None; raise CommandError if several differ."""
+    """Return the newest data set that was made from a file, or None."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    made = list(islice(client.datasets(digest), 50))
-    alike = {(each.sha256, *each.joint_names, each.torque_convention, each.report.robot): each for each in made[::-1]}
-    if len(alike) > 1:
-        listed = ", ".join(f"{each.id} ({_reading_of(each)})" for each in reversed(alike.values()))
-        raise CommandError(
-            f"{path.name} was uploaded before and read in {len(alike)} different ways: give the id of one data set: "
-            f"{listed}",
-            "`lipserve data show ID` shows how a data set was read; `lipserve data delete ID` deletes one",
-        )
-    return next(iter(alike.values()), None)
-
-
-def _reading_of(dataset: Dataset) -> str:
-    robot = "no robot" if dataset.report.robot is None else f"robot {dataset.report.robot}"
-    return f"{robot}, {dataset.created_at[:16].replace('T', ' ')}"
+    return next(iter(client.datasets(digest)), None)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from lipserve.address import DEFAULT_URL
 from lipserve.asking import Reading
 from service.cli import connecting
 from service.cli.connecting import advised, connected, robot_of, upload
-from service.cli.consoles import echo, out, print_json, print_result
+from service.cli.consoles import CommandError, echo, out, print_json, print_result
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
 from service.cli.wording import in_shell
 from service.contract.media_types import SUFFIXES
@@ -32,7 +32,8 @@ def _preparation(help_: str) -> Any:
 @app.command()
 def add(
     files: Annotated[
-        list[Path], typer.Argument(exists=True, dir_okay=False, help=f"Recordings to upload: {', '.join(SUFFIXES)}.")
+        list[str],
+        typer.Argument(help=f"Recordings to upload ({', '.join(SUFFIXES)}), or ids of data sets to read again."),
     ],
     name: Annotated[str | None, typer.Option(help="Name of the data set. Default: the file's name.")] = None,
     robot: Annotated[str | None, typer.Option(help="Profile such as panda, id of a URDF, or a .urdf file.")] = None,
@@ -81,7 +82,11 @@ def add(
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Upload recordings, one data set each (with --join: one for all), and print their reports."""
+    """Upload recordings, one data set each (with --join: one for all), and print their reports.
+
+    Given the id of a data set, its file is read again with these options and those of before. The old data set is
+    deleted unless a job used it.
+    """
     given = {
         "robot": robot,
         "joint_names": names(joint_names),
@@ -105,12 +110,20 @@ def add(
         "trim": trim,
     }
     reading: Reading = {key: value for key, value in given.items() if value is not None}  # type: ignore[assignment]
-    parts = [files] if join else [[each] for each in files]
+    again = [each for each in files if each.startswith("ds_")]
+    paths = [Path(each) for each in files if each not in again]
+    for path in paths:
+        if not path.is_file():
+            raise CommandError(f"The file {path} does not exist.")
+    if again and (join or name is not None):
+        raise CommandError(f"{again[0]} is a data set: --join and --name are options of files")
+    parts = [paths] if join else [[each] for each in paths]
     hint = "if the files are parts of one recording, add --join" if len(parts) > 1 else None
     with connected(url) as client, advised(hint):
         if robot is not None:
             reading["robot"] = robot_of(client, robot)
-        made = [upload(client, part, name, **reading) for part in parts]
+        made = [client.read_again(each, **reading) for each in again]
+        made += [upload(client, part, name, **reading) for part in parts]
     if as_json:
         print_json(made if len(made) > 1 else made[0])
         return
@@ -172,6 +185,10 @@ def _print(dataset: Dataset) -> None:
     echo(f"  {report.excitation.text}")
     for line in report.warnings:
         out.print(f"[yellow]warning:[/yellow] {escape(in_shell(line))}", highlight=False)
+    for remedy in report.remedies if report.upload_options is not None else []:
+        if remedy.options is not None:
+            options = in_shell(" ".join(f"{name}={value}" for name, value in remedy.options.items()))
+            echo(f"read again: lipserve data add {dataset.id} {options}")
     for line in report.advice:
         out.print(f"[cyan]next:[/cyan] {escape(in_shell(line))}", highlight=False)
 

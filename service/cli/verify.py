@@ -108,6 +108,8 @@ def _read_dataset(files: Files, row: DatasetRow) -> None:
     samples = files.read_samples(row.id, row.joint_names, row.sha256)
     if len(samples) != row.rows:
         raise ValueError(f"the file has {len(samples)} rows, expected {row.rows}")
+    if row.report.get("upload_options") is not None:
+        files.recording(row.id, row.report["upload_sha256"])
 
 
 def _robots(database: Database, files: Files) -> Iterator[_Finding]:

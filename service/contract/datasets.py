@@ -188,7 +188,7 @@ class Remedy(BaseModel):
     joints: list[str] = Field(description="Affected joints")
     text: str
     options: dict[str, str] | None = Field(
-        description="Query parameters to add when the file is uploaded again; null if none would help"
+        description="Query parameters to add when the file is read again; null if none would help"
     )
 
 
@@ -217,6 +217,10 @@ class DatasetReport(BaseModel):
     robot: str | None = Field(None, description="Robot with the limits that were compared with the data; null if none")
     upload_sha256: str | None = Field(
         None, description="Hash of the uploaded file; null if an earlier release stored it"
+    )
+    upload_kind: str | None = Field(None, description="Format in which the file was sent; null as `upload_options`")
+    upload_options: dict[str, Any] | None = Field(
+        None, description="Options of the upload; null if an earlier release stored it, without the file"
     )
     timing: Timing
     saturation: list[JointSaturation]

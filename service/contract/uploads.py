@@ -22,9 +22,9 @@ UPLOAD_BODY = upload_body(
     "A recording with at least positions, torques and times. Canonical columns are `t` (s), `q1..qn`, `dq1..`, "
     "`ddq1..`, `tau1..` and optionally `episode`, in SI units. Other names and units are recognised, or declared by "
     "`columns` and `units`. `dq` and `ddq` are derived if absent. NPZ has `q`, `dq`, `ddq`, `tau` (N, n), `t` or `dt`, "
-    "`episode` and `joint_names`. Bags have `sensor_msgs/JointState` or Franka states. A zip has the directory of a "
-    "LeRobot data set or a rosbag2, or text tables that are joined side by side: positions.txt, velocities.txt and "
-    "torques.txt may then lack column names.",
+    "`episode` and `joint_names`. Bags have messages of any type with numbers of each joint. A zip has the directory "
+    "of a LeRobot data set or a rosbag2, or text tables that are joined side by side: positions.txt, velocities.txt "
+    "and torques.txt may then lack column names.",
     {
         "text/csv": {"schema": {"type": "string"}, "example": "t,q1,dq1,ddq1,tau1\n0.0,0.1,0.0,0.2,1.5\n"},
         "application/x-ndjson": {
@@ -128,3 +128,9 @@ class UploadQuery(BaseModel):
         allow_inf_nan=False,
         description="Time to cut off at both ends of every part, s; by default the edges of the filter",
     )
+
+
+class RereadQuery(UploadQuery):
+    """Options for reading the file of a data set again."""
+
+    fresh: bool = Field(False, description="Use only these options; by default, those of the upload stay if not given")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import safe_open
-from sqlalchemy import select
+from sqlalchemy import String, cast, select
+from sqlalchemy import delete as delete_rows
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
@@ -21,9 +23,10 @@ from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
 from service.contract.datasets import MAX_PREVIEW_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.contract.states import ACTIVE
+from service.contract.uploads import RereadQuery, UploadQuery
 from service.datasets.mapping.checks import MIN_SAMPLES
 from service.datasets.mapping.reading import Recording
-from service.datasets.options import UploadOptions
+from service.datasets.options import upload_options
 from service.datasets.report.constants import estimate_constants
 from service.datasets.report.making import make_report
 from service.datasets.staging import Staged, column, prepare, staging
@@ -44,19 +47,19 @@ MAX_LISTED_IDS = 5
 
 
 def add(
-    storage: Storage, upload: Path, kind: str, name: str, options: UploadOptions, named: RequestIdentity | None = None
+    storage: Storage, upload: Path, kind: str, name: str, query: UploadQuery, named: RequestIdentity | None = None
 ) -> Dataset:
     """Read, check, prepare and store an upload, and delete its file.
 
-    Samples are stored first. The database row, which makes them visible, comes last. Columns are staged on disk below
-    the uploads. named: the request; if it was done before, its data set is returned.
+    Samples and a copy of the file are stored first. The database row, which makes them visible, comes last. Columns are
+    staged on disk below the uploads. named: the request; if it was done before, its data set is returned.
 
     Raise InvalidDataError, InvalidRequestError, TooLargeError, StorageFullError or ConflictError.
     """
     with storage.database.session() as session:
         if (before := find_done_row(session, DatasetRow, named)) is not None:
             return _show(before)
-    settings, disk = storage.settings, storage.disk
+    settings, disk, options = storage.settings, storage.disk, upload_options(query)
     profile = None if options.robot is None else profile_of(storage.database, options.robot)
     with staging(storage.files.uploads) as folder:
         upload = upload.rename(folder / upload.name)
@@ -74,11 +77,13 @@ def add(
                 staged.scale("tau", constants.values)
         gravity = recording.torque_convention == "gravity_included"
         report = make_report(raw, prepared, profile, recording.noted, options.recipe, gravity, recording.facts)
-        report["upload_sha256"] = sample_file.sha256(upload)
+        report["upload_sha256"], report["upload_kind"] = sample_file.sha256(upload), kind
+        report["upload_options"] = query.model_dump(exclude_unset=True, exclude={"name"}, exclude_none=True)
         report["joint_types"] = None if profile is None else _joint_types(profile, raw.joint_names)
         staged = prepared.staged
-        disk.reserve(sample_file.count_bytes(staged.rows, staged.n_joints))
+        disk.reserve(sample_file.count_bytes(staged.rows, staged.n_joints) + upload.stat().st_size)
         dataset = new_id("ds")
+        storage.files.keep_recording(dataset, upload)
         digest = storage.files.write_samples(dataset, staged.rows, staged.n_joints, partial(_array, staged))
     row = DatasetRow(
         id=dataset,
@@ -97,12 +102,44 @@ def add(
                 session.add(row)
     except (SQLAlchemyError, ConflictError) as error:
         if not is_undecided(error):
-            storage.files.delete_samples(dataset)
+            storage.files.delete_dataset(dataset)
         raise
     if before is not None:  # the same request finished first on another connection
-        storage.files.delete_samples(dataset)
+        storage.files.delete_dataset(dataset)
         return _show(before)
     return _show(row)
+
+
+def read_again(storage: Storage, dataset: str, query: RereadQuery, named: RequestIdentity | None = None) -> Dataset:
+    """Read the file of a data set with further options, as a new data set; delete the old one if no job used it.
+
+    Raise as `add` does, NotFoundError, DamagedDataError, or ConflictError if an earlier release stored the data set.
+    """
+    with storage.database.session() as session:
+        if (done := find_done_row(session, DatasetRow, named)) is not None:
+            return _show(done)
+        row = existing(session, dataset)
+    before = row.report.get("upload_options")
+    if before is None:
+        raise ConflictError(f"The file of data set {dataset!r} was not kept by an earlier release. Upload it again.")
+    upload = storage.files.upload()
+    try:
+        file = storage.files.recording(row.id, row.report["upload_sha256"])
+        storage.disk.reserve(file.stat().st_size)
+        shutil.copyfile(file, upload)
+        given = query.model_dump(exclude_unset=True, exclude_none=True, exclude={"fresh"})
+        merged = UploadQuery.model_validate(given if query.fresh else before | given)
+        made = add(storage, upload, row.report["upload_kind"], query.name or row.name, merged, named)
+    finally:
+        upload.unlink(missing_ok=True)
+    with storage.database.transaction() as session:
+        used = cast(JobRow.request["datasets"], String).contains(row.id)
+        replaced = session.scalar(select(JobRow.id).where(used).limit(1)) is None
+        if replaced:
+            session.execute(delete_rows(DatasetRow).where(DatasetRow.id == row.id))
+    if replaced:
+        storage.files.delete_dataset(row.id)
+    return made
 
 
 def show(database: Database, dataset: str) -> Dataset:
@@ -113,7 +150,8 @@ def show(database: Database, dataset: str) -> Dataset:
 def find(database: Database, dataset: str) -> DatasetRow:
     """Return the row of a data set by its id or its name.
 
-    Raise NotFoundError, or InvalidRequestError if several data sets have the name.
+    Of several readings of one file it is the newest. Raise NotFoundError, or InvalidRequestError if data sets of
+    several files have the name.
     """
     with database.session() as session:
         return existing(session, dataset)
@@ -130,7 +168,7 @@ def existing(session: Session, dataset: str) -> DatasetRow:
     rows = list(session.scalars(called))
     if not rows:
         raise not_found("dataset", dataset)
-    if len(rows) > 1:
+    if len({row.report.get("upload_sha256") or row.id for row in rows}) > 1:
         ids = ", ".join(each.id for each in rows[:MAX_LISTED_IDS]) + (" …" if len(rows) > MAX_LISTED_IDS else "")
         message = f"Several data sets are named {dataset!r}. Use one of their ids: {ids}."
         raise invalid_request("dataset", dataset, f"one of the ids {ids}", message)
@@ -175,7 +213,7 @@ def delete(storage: Storage, dataset: str) -> None:
                     f"data set {dataset!r} is in use by {job.id}: cancel this job or wait until it has finished"
                 )
         session.delete(row)
-    storage.files.delete_samples(row.id)
+    storage.files.delete_dataset(row.id)
 
 
 def _joint_types(profile: Profile, joint_names: Sequence[str]) -> list[JointType] | None:

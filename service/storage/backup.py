@@ -36,7 +36,7 @@ MANIFEST = "backup.json"
 MAX_ROUNDS = 20
 LOCK = ".lock"
 _NAMES = re.compile(
-    rf"{re.escape(FILE)}|{re.escape(MANIFEST)}|(datasets|learning)/[a-z]+_\w{{1,36}}\.safetensors"
+    rf"{re.escape(FILE)}|{re.escape(MANIFEST)}|(datasets|learning)/[a-z]+_\w{{1,36}}\.(safetensors|recording)"
     r"|versions/mv_\w{1,36}/[a-z][\w.-]{0,40}",
     re.ASCII,
 )
@@ -46,6 +46,10 @@ _KINDS = {
     "snapshots": "SELECT 'learning/' || id || '.safetensors' FROM snapshots",
 }
 """Queries of the files and folders that rows name; the columns are the same in every release."""
+_RECORDINGS = (
+    "SELECT 'datasets/' || id || '.recording' FROM datasets WHERE json_extract(report, '$.upload_options') IS NOT NULL"
+)
+"""Query of the uploaded files of data sets; earlier releases kept none."""
 
 
 class BackupError(ValueError):
@@ -125,7 +129,7 @@ def _connected(path: Path) -> sqlite3.Connection:
 
 
 def _named(reader: sqlite3.Connection) -> set[str]:
-    return {key for query in _KINDS.values() for (key,) in reader.execute(query)}
+    return {key for query in (*_KINDS.values(), _RECORDINGS) for (key,) in reader.execute(query)}
 
 
 def _counts(reader: sqlite3.Connection) -> dict[str, int]:

@@ -90,6 +90,7 @@ class Calls:
     datasets = Listed(calls.datasets.datasets)
     dataset = One(calls.datasets.dataset)
     preview = One(calls.datasets.preview)
+    read_again = One(calls.datasets.read_again)
     delete_dataset = One(calls.datasets.delete_dataset)
     upload_robot = One(calls.datasets.upload_robot)
     robots = Listed(calls.datasets.robots)

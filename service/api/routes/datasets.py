@@ -15,7 +15,7 @@ from service.api.limits.upload import Kinds, receive_to
 from service.api.route import Route
 from service.contract.datasets import Dataset, DatasetPage, Preview
 from service.contract.media_types import MEDIA_TYPES, SUFFIXES
-from service.contract.uploads import UPLOAD_BODY, UploadQuery
+from service.contract.uploads import UPLOAD_BODY, RereadQuery, UploadQuery
 from service.datasets import store
 from service.datasets.options import upload_options
 from service.datasets.staging import QUANTITIES
@@ -64,18 +64,52 @@ async def upload(
 
     A wrong recording is rejected: `detail` names the column or row and what was expected.
     """
-    options = upload_options(query)
+    upload_options(query)  # rejects wrong options before the body is read
     path = storage.files.upload()
     try:
         kind, file_name = await receive_to(request, path, Kinds(MEDIA_TYPES, SUFFIXES), storage.disk)
         asked = (sorted(request.query_params.multi_items()), kind, file_name)
         named = await to_thread.run_sync(partial(identify_request, idempotency_key, *asked, file=path))
         called = query.name or file_name or "unnamed"
-        dataset = await to_thread.run_sync(store.add, storage, path, kind, called, options, named, limiter=turns)
+        dataset = await to_thread.run_sync(store.add, storage, path, kind, called, query, named, limiter=turns)
     finally:
         path.unlink(missing_ok=True)
     response.headers["Location"] = f"/v1/datasets/{dataset.id}"
     return dataset
+
+
+@router.post(
+    "/{dataset}/read",
+    status_code=status.HTTP_201_CREATED,
+    summary="Read the file of a data set again",
+    responses=responses(
+        InvalidDataError,
+        InvalidRequestError,
+        TooLargeError,
+        NotFoundError,
+        DamagedDataError,
+        ConflictError,
+        NotInstalledError,
+    ),
+)
+@needs(TRAIN)
+async def read_again(
+    request: Request,
+    response: Response,
+    storage: StorageDep,
+    turns: UploadsDep,
+    dataset: str,
+    query: Annotated[RereadQuery, Query()],
+    idempotency_key: KeyHeader = None,
+) -> Dataset:
+    """Read the uploaded file with further options, without another upload, and return a new data set.
+
+    The old data set is deleted unless a job used it.
+    """
+    named = identify_request(idempotency_key, dataset, sorted(request.query_params.multi_items()))
+    made = await to_thread.run_sync(store.read_again, storage, dataset, query, named, limiter=turns)
+    response.headers["Location"] = f"/v1/datasets/{made.id}"
+    return made
 
 
 @router.get("", summary="List data sets, newest first")

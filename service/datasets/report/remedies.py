@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from lipcore.profiles import profile
 from service.contract.datasets import Cause, Remedy
 from service.datasets.mapping.choice import format_numbers as numbers
-from service.datasets.report.texts import with_upload
+from service.datasets.report.texts import with_options
 
 
 @dataclass(frozen=True)
@@ -90,20 +89,8 @@ def make_remedy(
 ) -> Remedy:
     """Return a fault with its correction.
 
-    options: upload options, as on the command line. only_if: condition under which the correction is right.
+    options: query parameters of an upload. only_if: condition under which the correction is right.
     """
     if options is not None:
-        text = with_upload(text, format_flags(options), only_if)
+        text = with_options(text, options, only_if)
     return Remedy(cause=cause, joints=list(joints), text=text, options=options)
-
-
-def format_flags(options: Mapping[str, str]) -> str:
-    """Format options of an upload for the command line."""
-    out = []
-    for name, value in options.items():
-        if name == "columns":
-            named = (f"{quantity}={','.join(columns)}" for quantity, columns in json.loads(value).items())
-            out += [f"--column {shlex.quote(each)}" for each in named]
-        else:
-            out.append(f"--{name.replace('_', '-')}{'=' if value.startswith('-') else ' '}{shlex.quote(value)}")
-    return " ".join(out)

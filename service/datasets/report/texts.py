@@ -92,10 +92,11 @@ def _lags(seconds: float) -> str:
 # Faults and their corrections
 
 
-def with_upload(fault: str, flags: str, only_if: str | None) -> str:
-    """Add the options of an upload that correct a fault."""
-    start = "Upload" if only_if is None else f"If {only_if}, upload"
-    return f"{fault} {start} the file again with `{flags}`."
+def with_options(fault: str, options: Mapping[str, str], only_if: str | None) -> str:
+    """Add the options that correct a fault, as the API names them; `service.cli.wording` has those of the shell."""
+    start = "Read" if only_if is None else f"If {only_if}, read"
+    listed = " ".join(f"{name}={value}" for name, value in options.items())
+    return f"{fault} {start} the file again with `{listed}`."
 
 
 def energy_loss(watts: float) -> str:
@@ -205,7 +206,7 @@ def unknown_robot(examples: Sequence[str]) -> str:
     """Ask for the robot's name. examples: robots with as many joints."""
     return (
         "No robot is named, and the joint names match none. If it is one of `lipserve robots list` "
-        f"(with as many joints: {list_names(examples)}), upload the file again with `--robot` "
+        f"(with as many joints: {list_names(examples)}), read the file again with `robot` "
         "to check friction, limits and torque."
     )
 

@@ -114,8 +114,8 @@ class LocalFiles:
         return ()
 
     def sweep(self, datasets: Collection[str], versions: Collection[str], snapshots: Collection[str]) -> int:
-        """Delete all files but these; return the number of deleted ones."""
-        left = [path for path in self.datasets.iterdir() if path.name.removesuffix(".safetensors") not in datasets]
+        """Delete all files but those of these names, and snapshots; return the number of deleted ones."""
+        left = [path for path in self.datasets.iterdir() if path.name not in datasets]
         left += [path for path in self.versions.iterdir() if path.name not in versions]
         for path in left:
             remove(path)

@@ -140,7 +140,7 @@ class SharedFiles:
     def sweep(self, datasets: Collection[str], versions: Collection[str], snapshots: Collection[str]) -> int:
         """Delete files that are none of these and a day old, for all services; return their number."""
         old = partial(self._old, self._now() - DAY_S)
-        left = [each for each in old("datasets/") if _name(each).removesuffix(SUFFIX) not in datasets]
+        left = [each for each in old("datasets/") if _name(each) not in datasets]
         left += [each for each in old("versions/") if each.key.split("/")[1] not in versions]
         left += [each for each in old("learning/") if _name(each).removesuffix(SUFFIX) not in snapshots]
         for each in left:

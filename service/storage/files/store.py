@@ -10,11 +10,13 @@ import hashlib
 import logging
 import os
 import secrets
+import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -145,10 +147,23 @@ class Files:
         except DamagedFileError as error:
             raise DamagedDataError(f"data set {dataset!r} is damaged: {error}. Upload it again") from error
 
-    def delete_samples(self, dataset: str) -> None:
-        """Delete samples; do nothing if there are none."""
+    def keep_recording(self, dataset: str, upload: Path) -> None:
+        """Store the uploaded file of a data set durably."""
+        with upload.open("rb") as source:
+            self._place.write(_recording(dataset), partial(shutil.copyfileobj, source))
+
+    def recording(self, dataset: str, sha256: str) -> Path:
+        """Return the path of the uploaded file of a data set; raise DamagedDataError. See `samples_file`."""
+        try:
+            return self._checked(_recording(dataset), sha256)
+        except DamagedFileError as error:
+            raise DamagedDataError(f"The file of data set {dataset!r} is damaged: {error}. Upload it again") from error
+
+    def delete_dataset(self, dataset: str) -> None:
+        """Delete samples and the uploaded file; do nothing if there are none."""
         with _forgiven():
             self._place.delete(_samples(dataset))
+            self._place.delete(_recording(dataset))
 
     def write_snapshot(self, snapshot: str, payload: bytes) -> str:
         """Store the learnt state of a version durably under a new id; return its sha256."""
@@ -234,7 +249,8 @@ class Files:
 
         In a shared store, only files that are a day old: other services are writing.
         """
-        return self._place.sweep(datasets, versions, snapshots)
+        named = {key.partition("/")[2] for each in datasets for key in (_samples(each), _recording(each))}
+        return self._place.sweep(named, versions, snapshots)
 
     def sweep_snapshots(self, named: Collection[str]) -> int:
         """Delete all snapshots but those named at once; return their number.
@@ -284,6 +300,10 @@ def _forgiven() -> Iterator[None]:
 
 def _samples(dataset: str) -> str:
     return f"datasets/{dataset}.safetensors"
+
+
+def _recording(dataset: str) -> str:
+    return f"datasets/{dataset}.recording"
 
 
 def _snapshot(snapshot: str) -> str:

@@ -66,7 +66,7 @@ def test_concurrent_uploads_make_one_data_set(api):
     before = {path.name for path in folder.iterdir()}
     status, made = at_once(lambda: post(api, "up-6"))
     assert status == 201
-    assert {path.name for path in folder.iterdir()} - before == {f"{made}.safetensors"}
+    assert {path.name for path in folder.iterdir()} - before == {f"{made}.safetensors", f"{made}.recording"}
 
 
 def test_repeated_request_queues_one_job(api, pendulum):

@@ -33,7 +33,7 @@ def test_api_fields_become_command_line_options(said):
 @pytest.mark.parametrize(
     "said",
     [
-        "upload the file again with `--torque-factors=-1,1`",
+        "read the file again with `--torque-factors=-1,1`",
         "row 41 is 29 values, expected 30 values",
         "the joints of the model, joint1: the rate is 3 Hz",
         'columns={"broken": is no JSON',

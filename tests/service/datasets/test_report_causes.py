@@ -25,7 +25,6 @@ from service.datasets.mapping.reading import read
 from service.datasets.options import upload_options
 from service.datasets.report.causes import TorqueWork
 from service.datasets.report.making import make_report
-from service.datasets.report.remedies import format_flags
 from service.datasets.staging import prepare
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
@@ -37,6 +36,10 @@ ARMS = ("ur10", "talos-left", "ur3", "xarm7", "tiago-pro-left", "pr2-left", "so1
 COURSES = (("sinusoids", FAST_SPEED), ("periodic", 1.0), ("rests", 1.0))
 RECORDINGS = [(arm, *COURSES[place % 3], dirty) for place, arm in enumerate(ARMS) for dirty in (False, True)]
 QUICK = ("talos-left", "periodic", 1.0, True)
+
+
+def listed(options: dict[str, str]) -> str:
+    return " ".join(f"{name}={value}" for name, value in options.items())
 
 
 @cache
@@ -111,7 +114,7 @@ def test_defect_is_named_and_its_options_correct_it(defect: str, tmp_path: Path)
     (remedy,) = report.remedies
     assert remedy.cause == defect.split(" of ", maxsplit=1)[0]
     assert remedy.text in report.warnings
-    assert f"pload the file again with `{format_flags(remedy.options)}`" in remedy.text
+    assert f"ead the file again with `{listed(remedy.options)}`" in remedy.text
     mended = upload(tmp_path, columns, **query | remedy.options)
     assert mended.remedies == []
 
@@ -210,7 +213,7 @@ def test_names_and_torque_suggest_the_robot(
     report = report_on(tmp_path, names, columns, **about)
     assert [(each.cause, each.options) for each in report.remedies] == [("robot", suggested)]
     if given is None:
-        assert format_flags(suggested) in " ".join(report.advice)
+        assert listed(suggested) in " ".join(report.advice)
         assert report.against_robot.robot == arm
         assert report.warnings == []
 
@@ -231,7 +234,7 @@ def test_friction_is_judged_beside_the_robot_that_names_suggest(tmp_path: Path) 
     other = report_on(tmp_path, tuple(f"axis{joint}" for joint in range(1, 8)), columns)
     assert other.excitation.friction_beside == "any motion"
     assert any("constant torque" in each for each in other.advice)
-    assert "panda, fr3 and xarm7), upload the file again with `--robot`" in other.advice[0]
+    assert "panda, fr3 and xarm7), read the file again with `robot`" in other.advice[0]
     assert not any("No robot is named" in each for each in (*report.advice, *with_robot.advice))
 
 

@@ -172,3 +172,26 @@ def test_joint_names_are_not_interpreted_as_markup(visitor: Visitor, dashboard: 
     assert named
     assert not [name for name in named if "<" in name]
     expect(page.locator("a[href*='elsewhere']")).to_have_count(0)
+
+
+def test_file_is_read_again_with_other_options(visitor: Visitor, dashboard: Dashboard) -> None:
+    first = upload(dashboard.client, SAMPLES, name="again", torque_factors="1,-1")["id"]
+    visitor.expect_refusals(422)
+    page = visitor.open(f"#/data/{first}")
+    again = page.get_by_role("region", name="Read again")
+    again.get_by_text("Import options").click()
+    factors = again.get_by_label("Torque factors")
+    expect(factors).to_have_value("1,-1")
+    factors.fill("1")
+    again.get_by_role("button", name="Read again", exact=True).click()
+    expect(page.get_by_role("alert")).to_contain_text("Nothing was stored. ")
+    factors.fill("")
+    again.get_by_label("Joint names").fill("shoulder, elbow")
+    again.get_by_role("button", name="Read again", exact=True).click()
+    expect(page).not_to_have_url(re.compile(first))
+    expect(page.get_by_role("heading", level=1)).to_have_text("again")
+    dataset = dashboard.client.get("/v1/datasets/again").json()
+    assert dataset["report"]["upload_options"] == {"joint_names": "shoulder, elbow"}
+    assert dashboard.client.get(f"/v1/datasets/{first}").status_code == 404
+    drawn(page)
+    audit(page)

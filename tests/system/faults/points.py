@@ -58,7 +58,7 @@ UPLOADS = [
     Point(
         "deletion of a data set: before its file is removed",
         actions.DeleteDataset,
-        Fault(f"{FILES}.delete_samples"),
+        Fault(f"{FILES}.delete_dataset"),
         "all",
     ),
 ]

@@ -62,6 +62,42 @@ def upload(
     )
 
 
+@route("POST", "/v1/datasets/{dataset}/read", repeatable=True)
+def read_again(
+    _route: Route,
+    dataset: str,
+    *,
+    fresh: bool = False,
+    idempotency_key: str | None = None,
+    **reading: Unpack[Reading],
+) -> Call[Dataset]:
+    """Read the file of a data set with further options, without another upload.
+
+    Args:
+        dataset: Id or name of the data set. It is deleted afterwards unless a job used it.
+        fresh: Use only these options. By default, those of the upload stay if they are not given.
+        idempotency_key: Calls with the same key give one data set, also from other clients.
+        **reading: Options as of `upload`.
+
+    Returns:
+        The new data set with its report.
+
+    Raises:
+        ApiError: The service rejects the file with these options.
+
+    Example:
+        >>> client.read_again("ds_0123456789abcdef", torque_factors=[1, -1]).id
+        'ds_fedcba9876543210'
+    """
+    return _route(
+        record(Dataset),
+        names={"dataset": dataset},
+        params={**query_of(reading), **({"fresh": "true"} if fresh else {})},
+        headers={KEY_HEADER: idempotency_key or new_key()},
+        timeout=UPLOAD_TIMEOUT,
+    )
+
+
 @route("GET", "/v1/datasets")
 def datasets(_route: Route, upload_sha256: str | None = None) -> Call[Page[Dataset]]:
     """List data sets, newest first. upload_sha256: only those made from files with this SHA-256."""

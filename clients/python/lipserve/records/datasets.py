@@ -231,7 +231,7 @@ class Remedy(Record, frozen=True, kw_only=True):
     """A fault that would spoil a model, and the upload options that correct it.
 
     joints: Affected joints
-    options: Query parameters to add when the file is uploaded again; null if none would help
+    options: Query parameters to add when the file is read again; null if none would help
     """
 
     cause: Literal[
@@ -269,6 +269,8 @@ class DatasetReport(Record, frozen=True, kw_only=True):
     joint_types: Joint types of the robot, which training jobs use by default; null if unknown
     robot: Robot with the limits that were compared with the data; null if none
     upload_sha256: Hash of the uploaded file; null if an earlier release stored it
+    upload_kind: Format in which the file was sent; null as `upload_options`
+    upload_options: Options of the upload; null if an earlier release stored it, without the file
     lag: All joints combined first, then each joint
     against_robot: Null without a robot's URDF
     remedies: Corrections of the upload's options that `warnings` and `advice` mention
@@ -292,6 +294,8 @@ class DatasetReport(Record, frozen=True, kw_only=True):
     joint_types: list[Literal["revolute", "prismatic"]] | None = None
     robot: str | None = None
     upload_sha256: str | None = None
+    upload_kind: str | None = None
+    upload_options: dict[str, Any] | None = None
     timing: Timing
     saturation: list[JointSaturation]
     limits: list[JointLimits]

@@ -52,7 +52,7 @@ def test_unreachable_endpoint_is_detected_and_its_return_too(s3, bucket, tmp_pat
     try:
         assert all("does not answer" in each for each in error_messages(files))
         assert files.samples_file("ds_one", digest).exists()
-        files.delete_samples("ds_one")  # the copy is swept later
+        files.delete_dataset("ds_one")  # the copy is swept later
     finally:
         s3.start()
     assert Files(tmp_path / "other", bucket).samples_file("ds_one", digest).exists()

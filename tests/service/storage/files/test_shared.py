@@ -81,7 +81,7 @@ def test_second_read_uses_the_local_copy(one, other, publish):
     digest = put(one)
     publish(one)
     first = other.samples_file("ds_one", digest), other.version_folder("mv_one")
-    one.delete_samples("ds_one")
+    one.delete_dataset("ds_one")
     one.delete_version("mv_one")
     assert stored_keys(one) == []
     assert (other.samples_file("ds_one", digest), other.version_folder("mv_one")) == first

@@ -127,12 +127,13 @@ def column(home, query):
 
 def check_restored(home):
     """Check that every row has its file, every file its row, and that no file is damaged."""
-    for folder, query in (
-        ("datasets", "SELECT id || '.safetensors' FROM datasets"),
-        ("versions", "SELECT folder FROM versions"),
-        ("learning", "SELECT id || '.safetensors' FROM snapshots"),
+    for folder, queries in (
+        ("datasets", [f"SELECT id || '.{each}' FROM datasets" for each in ("safetensors", "recording")]),
+        ("versions", ["SELECT folder FROM versions"]),
+        ("learning", ["SELECT id || '.safetensors' FROM snapshots"]),
     ):
-        assert sorted(path.name for path in (home / folder).glob("*")) == sorted(column(home, query))
+        named = [name for query in queries for name in column(home, query)]
+        assert sorted(path.name for path in (home / folder).glob("*")) == sorted(named)
     assert verify_home(Settings(home=home)).damages == []
 
 

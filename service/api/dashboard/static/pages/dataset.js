@@ -3,6 +3,7 @@
 import { del, get, path } from "../api.js";
 import { h, replace } from "../dom.js";
 import { button, confirm, errorBox, heading, link, notice, tabs } from "../ui.js";
+import { readingAgain } from "./data/again.js";
 import { excitationTab, frictionTab, preparationTab, timingTab } from "./data/figures.js";
 import { signals } from "./data/signals.js";
 import { recommendations, summary } from "./data/report.js";
@@ -63,7 +64,9 @@ export async function render(view, { id, query }, { signal, title }) {
     location.hash = "#/data";
   }, { kind: "danger" });
   const list = h("div", {});
-  replace(view, heading(dataset.name, train, remove), summary(dataset), recommendations(dataset), list, panel);
+  const [warnings, advice] = recommendations(dataset);
+  const { corrections, form } = await readingAgain(dataset, signal);
+  replace(view, heading(dataset.name, train, remove), summary(dataset), warnings, corrections, advice, list, panel, form);
   const bar = tabs(TABS.map(([tab, label]) => [tab, label]), show, state.tab);
   bar.setAttribute("aria-label", `Report of ${dataset.name}`);
   replace(list, bar);

@@ -13,7 +13,7 @@ const QUANTITIES = [
   ["episode", "episode", []],
 ];
 
-/** Create the form. Returns {element, values(), fillRobots(robots)}; values(): query of the upload. */
+/** Create the form. Returns {element, fill(query), values(), fillRobots(robots)}; values(): query of the upload. */
 export function uploadOptions() {
   const inputs = {
     effort: select("effort", [["", "default of the robot or the file"], ...pairs(EFFORTS, ["measured", "commanded", "current"])]),
@@ -28,6 +28,8 @@ export function uploadOptions() {
     joints: textInput("joints", "all"),
     drop_joints: textInput("drop_joints", "gripper"),
     topic: textInput("topic", "/joint_states"),
+    column_names: textInput("column_names", "t,q1..q7,tau1..tau7"),
+    dt: numberInput("dt", "from the file", "0.000001", "100"),
     delimiter: select("delimiter", [["", "auto-detect"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]]),
     filtering: select("filtering", [
       ["", "only if signals are derived (default)"],
@@ -107,6 +109,8 @@ export function uploadOptions() {
       field("Trim at both ends, s", inputs.trim),
       field("Torque convention", inputs.torque_convention),
       field("Topic", inputs.topic, "Required if several topics of a bag can be read. Topics separated by commas are merged by time."),
+      field("Time from row to row, s", inputs.dt, "For files without times."),
+      field("Column names", inputs.column_names, "For text without a header."),
       field("Delimiter", inputs.delimiter, "For CSV files."),
     ),
   );
@@ -114,6 +118,13 @@ export function uploadOptions() {
   return {
     element,
     fillRobots: robot.fill,
+    fill: (given) => {
+      robot.choose(given.robot ?? "");
+      for (const [name, input] of Object.entries(inputs)) input.value = given[name] ?? "";
+      for (const [json, of] of [[given.columns, columns], [given.units, units]])
+        for (const [name, what] of Object.entries(JSON.parse(json ?? "{}"))) of[name].value = [what].flat().join(", ");
+      showConstants();
+    },
     values: () => {
       const given = { robot: robot.select.value };
       for (const [name, input] of Object.entries(inputs)) given[name] = name === "delimiter" ? input.value : input.value.trim();
