@@ -85,7 +85,6 @@ async def upload(
     responses=responses(
         InvalidDataError,
         InvalidRequestError,
-        TooLargeError,
         NotFoundError,
         DamagedDataError,
         ConflictError,
