@@ -15,7 +15,7 @@ from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_from_torque
 from lipcore.kernels.drive.kernel import Bodies, Drive, Elements
 from lipcore.kernels.drive.play import element_widths
-from lipcore.kernels.drive.terms import BASE_TERMS, MAX_GAIN_STD, check_kinds
+from lipcore.kernels.drive.terms import BASE_TERMS, MAX_GAIN_STD, SIGN_WIDTH, check_kinds
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.vocabulary import DriveKind, GeometryMode, JointType
@@ -70,7 +70,8 @@ def make_problem(
     motions, tau = _in_chain(samples, order)
     usual = np.sqrt(np.mean(every.tau**2, axis=0))[order]
     floor, start = noise.floor(every)[order], noise.start(every)[order]
-    speed = np.maximum(np.sqrt(np.mean(every.dq**2, axis=0))[order], 1e-3)
+    speed = np.sqrt(np.mean(every.dq**2, axis=0))[order]
+    speed[speed < SIGN_WIDTH] = 1.0  # of a joint that stood still
     # the prior std of a joint's friction weights is its torque
     friction = np.stack([usual / speed, usual, usual], axis=1).reshape(-1) + floor.repeat(len(BASE_TERMS))
     anywhere = unit_from_torque(float(usual.max()), n)

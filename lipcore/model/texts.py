@@ -35,6 +35,13 @@ def describe_dependent_motion(dimensions: float, joints: int) -> str:
     )
 
 
+STANDSTILL = (
+    "The robot stood still in the recording. The model knows gravity at positions like the recorded ones. In motion it "
+    "answers with gravity, and tau_std includes unknown friction and inertia."
+)
+"""Warning that no joint moved."""
+
+
 def describe_search_limit(seconds: float) -> str:
     """Return the warning that the search for the geometry ended early."""
     return (

@@ -16,6 +16,7 @@ from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.drive.play import ELEMENTS, PlayFollower, PlayState, element_widths, with_deflections
+from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.model import external
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
@@ -114,7 +115,8 @@ class TorqueModel:
 
     If the posterior variance of a torque (without misfit and floor) exceeds its variance in training, the prediction
     falls back to gravity, offset and friction. If these are not determined either, it falls back to the mean torque in
-    training (eq. 26 of docs/method.md). Without `training_torque` no prediction falls back.
+    training, or to gravity for a joint that stood still there (eq. 26 of docs/method.md). Without `training_torque` no
+    prediction falls back.
     """
 
     estimator: Estimator
@@ -302,4 +304,5 @@ class TorqueModel:
             posterior.floor,
             posterior.misfit.packed(),
             None if torque is None else (np.array(torque["mean"]), np.square(torque["std"])),
+            np.abs([self.training_range["dq"][end] for end in ("min", "max")]).max(0) < SIGN_WIDTH,
         )

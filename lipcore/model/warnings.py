@@ -64,7 +64,7 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
     if REFIT_ERROR in fit:
         out.append(texts.describe_failed_fit(str(fit[REFIT_ERROR])))
     moved = float(fit.get("motion_dimensions", model.n_joints))
-    together = texts.describe_dependent_motion(moved, model.n_joints)
+    together = texts.describe_dependent_motion(moved, model.n_joints) if moved else texts.STANDSTILL
     moved_together = moved < 0.7 * model.n_joints
     if arm is None:
         return [*out, together] if moved_together else out

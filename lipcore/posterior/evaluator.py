@@ -77,7 +77,7 @@ class Evaluator:
     None without `term`. outputs: (m,), the chosen torques, as sample · n + joint. linear: the linear terms in the order
     of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,) (N·m)²;
     misfit: see `Misfit.packed`; None for no floor or misfit. usual: mean and variance of the torque in
-    training, (n,) each, if predictions may fall back.
+    training, (n,) each, if predictions may fall back; stood: joints that stood still there, (n,).
 
     Without a nonlinear term, torques and standard deviations are computed joint by joint, each from the weights that it
     depends on; covariances need them all. The prior mean of a residual among the linear terms is added to the mean, the
@@ -104,6 +104,7 @@ class Evaluator:
         floor: Array | None = None,
         misfit: Array | None = None,
         usual: tuple[Array, Array] | None = None,
+        stood: NDArray[np.bool_] | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
             raise ValueError("expected both term and inducing, or neither")
@@ -148,6 +149,7 @@ class Evaluator:
         self._falls_back = usual is not None
         self._usual_mean: Array = np.zeros(n) if usual is None else usual[0]
         self._usual: Array = np.full(n, np.inf) if usual is None else usual[1]
+        self._stood = np.zeros(n, np.bool_) if stood is None else stood
         sizes = samples, len(self._outputs) + len(means), len(means), n
         self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
 
@@ -258,9 +260,10 @@ class Evaluator:
     def fall_back(self, motions: Array, tau: Array, share: Array) -> Array:
         """Return the torques to send at N queries, given tau and share of `many`, (N, n) each (eq. 26).
 
-        They are (1 − share) tau + share h, with the fallback h = (1 − share_s) s + share_s (t + p). s is the posterior
-        mean at rest in the same posture, but with friction and payload in motion, and share_s its own share. t is the
-        mean torque in training, p the mean torque of the payload. motions: as of `Motion.arrays`.
+        They are (1 − share) tau + share h, with the fallback h = (1 − share_s) s + share_s r. s is the posterior mean
+        at rest in the same posture, but with friction and payload in motion, and share_s its own share. r = t + p, the
+        mean torque in training and that of the payload. For joints that stood still in training, which shows no
+        friction, r = (1 − share_g) g + share_g (t + p) with g at rest. motions: as of `Motion.arrays`.
         """
         scratch, harmless = self._many, np.empty_like(tau)
         slopes = self._slopes[self._payload]
@@ -270,9 +273,15 @@ class Evaluator:
             still = scratch.motions[:count]
             still[:, 0], still[:, 1:] = moving[:, 0], 0.0
             static, own = harmless[rows], scratch.share[:count]
-            self._answer(scratch, still, moving, STD, static, scratch.std[:count], scratch.covariance[:count], own)
+            outputs = STD, static, scratch.std[:count], scratch.covariance[:count], own
+            gravity, without = np.zeros_like(static), np.ones_like(static)
+            if self._stood.any():
+                self._answer(scratch, still, still, *outputs)
+                gravity[:, self._stood], without[:, self._stood] = static[:, self._stood], own[:, self._stood]
+            self._answer(scratch, still, moving, *outputs)
             payload = np.einsum("p,kpj->kj", slopes, scratch.features[:count, self._payload])
-            static[:] = (1.0 - own) * static + own * (self._usual_mean + payload)
+            rest = (1.0 - without) * gravity + without * (self._usual_mean + payload)
+            static[:] = (1.0 - own) * static + own * rest
         return np.asarray((1.0 - share) * tau + share * harmless)
 
     def warm_up(self) -> None:

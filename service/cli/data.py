@@ -62,6 +62,9 @@ def add(
         typer.Option("--columns", help="Names of all columns, for text without a header: t,q1..q7,tau1..tau7."),
     ] = None,
     dt: Annotated[float | None, typer.Option(help="Time step, s, for files without times.")] = None,
+    poses: Annotated[
+        bool, typer.Option("--poses", help="Every row is a held pose: no times or velocities are needed.")
+    ] = False,
     join: Annotated[
         bool,
         typer.Option(
@@ -102,6 +105,7 @@ def add(
         "delimiter": delimiter,
         "column_names": names(column_names),
         "dt": dt,
+        "poses": poses or None,
         "cutoff": cutoff,
         "filtering": filtering,
         "form": form,

@@ -14,7 +14,7 @@ FLAGS = {
     **{name: f"--{name}" for name in ("robot", "effort", "topic", "delimiter", "cutoff", "filtering", "rate", "gap")},
     **{name: f"--{name}" for name in ("trim", "joints", "form", "model", "estimator", "base", "promotion")},
     **{"drop_joints": "--drop", "columns": "--column", "units": "--unit", "options": "--option"},
-    **{"column_names": "--columns", "dt": "--dt", "scale": "--scale"},
+    **{"column_names": "--columns", "dt": "--dt", "poses": "--poses", "scale": "--scale"},
     **{"holdout.share": "--hold-out", "holdout.kind": "--hold-out-by", "holdout.only": "--hold-out-only"},
 }
 """Command line options by API field."""
@@ -62,4 +62,6 @@ def _named(flag: str, given: Mapping[str, Any]) -> str:
 
 
 def _option(name: str, value: str) -> str:
+    if value == "true":
+        return FLAGS[name]
     return f"{FLAGS[name]}{'=' if value.startswith('-') else ' '}{shlex.quote(value)}"

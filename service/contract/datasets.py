@@ -153,6 +153,9 @@ class Excitation(BaseModel):
     motion_dimensions: float | None = Field(
         None, description="Number of independent motions: 1 if all joints move together, n if each moves on its own"
     )
+    period_s: float | None = Field(
+        None, description="Time after which the motion repeats itself, s; null if it does not"
+    )
     whole: WholeExcitation | None
     text: str = Field(description="Summary in words")
 

@@ -109,6 +109,10 @@ class UploadQuery(BaseModel):
     dt: float | None = Field(
         None, gt=0, le=100, allow_inf_nan=False, description="Time from row to row of a file without times, s"
     )
+    poses: bool = Field(
+        False,
+        description="Whether each row is a held pose, without times and velocities. Consecutive equal poses are averaged",
+    )
     cutoff: float = Field(CUTOFF, gt=0, le=1000, allow_inf_nan=False, description="Cut-off of the low-pass, Hz")
     filtering: Filtering = Field(
         "derived",
@@ -133,4 +137,4 @@ class UploadQuery(BaseModel):
 class RereadQuery(UploadQuery):
     """Options for reading the file of a data set again."""
 
-    fresh: bool = Field(False, description="Use only these options; by default, those of the upload stay if not given")
+    fresh: bool = Field(False, description="Ignore the options of the upload")

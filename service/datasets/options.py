@@ -44,6 +44,8 @@ class ReadOptions:
     """Column names of text without a header."""
     dt: float | None = None
     """Time between rows without times, s."""
+    poses: bool = False
+    """Whether every row is a held pose."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ def upload_options(query: UploadQuery) -> UploadOptions:
         torque_factors=_numbers("torque_factors", query.torque_factors, "no unit"),
         column_names=_ranges("column_names", query.column_names),
         dt=query.dt,
+        poses=query.poses,
     )
     recipe = Recipe(
         cutoff_hz=query.cutoff,

@@ -23,10 +23,14 @@ from service.foundation.errors import invalid_data, readable
 from service.storage.disk import Disk, DiskBudget
 
 TIME, EPISODE = "t", "episode"
+POSES_HINT = ". Set poses=true if every row is a held pose"
 NO_TIMES_HINT = (
-    '. Set dt=0.01 if the rows are 0.01 s apart, or columns={"t": "…"} if a column of another name holds the times'
+    '. Set dt=0.01 if the rows are 0.01 s apart, columns={"t": "…"} if a column of another name holds the times, or '
+    "poses=true if every row is a held pose"
 )
 QUANTITIES = ("q", "dq", "ddq", "tau")
+SAME_POSE = 0.01
+"""Max change of each position, rad or m, from row to row of the same pose."""
 
 
 def column(quantity: str, joint: int) -> str:
@@ -101,6 +105,28 @@ class Staged:
         if len(values) != count:
             raise OSError(f"column {name} has {len(values)} rows on disk, expected {count}")
         return values
+
+    def average_poses(self) -> int:
+        """Replace consecutive rows at the same pose by their mean, add velocities and accelerations of zero.
+
+        Each pose is an episode. Rows that lack a value are dropped. Return the number of poses.
+        """
+        complete = ~self.missing()
+        moved = np.zeros(int(complete.sum()), dtype=np.bool_)
+        for joint in range(self.n_joints):
+            q = self.read(column("q", joint))[complete]
+            moved |= np.abs(np.diff(q, prepend=q[:1])) > SAME_POSE
+        starts = np.flatnonzero(np.concatenate([[True], moved[1:]])) if len(moved) else np.zeros(0, np.int64)
+        counts = np.diff(np.append(starts, len(moved)))
+        for name in list(self._rows):
+            values = self.read(name)[complete]
+            (np.add.reduceat(values, starts) / counts if len(starts) else values).tofile(self.folder / f"{name}.f64")
+            self._rows[name] = len(starts)
+        self._missing = None
+        zeros = np.zeros(len(starts))
+        self.append({EPISODE: np.arange(float(len(starts)))})
+        self.append({column(each, joint): zeros for each in ("dq", "ddq") for joint in range(self.n_joints)})
+        return len(starts)
 
     def scale(self, quantity: str, factors: Array) -> None:
         """Multiply a quantity of each joint by a factor, (n,)."""
@@ -181,6 +207,7 @@ def prepare(
         made = plan(t, episode, missing, raw.quantities, recipe, damaged.rows, braked.rows)
     except (CorruptRowsError, PreparationError) as error:
         hint = NO_TIMES_HINT if (error.field, error.value) == (TIME, "missing") else ""
+        hint = POSES_HINT if error.field == "cutoff" else hint
         raise invalid_data(error.field, error.value, f"{error.expected}{hint}", f"{error}{hint}") from None
     if len(made) < min_samples:
         why = "trimming the filter's edges" if made.cutoff is not None else "dropping unusable rows"

@@ -38,6 +38,8 @@ class Reading(TypedDict, total=False):
     """Names of all columns of text without a header."""
     dt: float
     """Time step of files without times, s."""
+    poses: bool
+    """Whether every row is a held pose."""
     cutoff: float
     """Cutoff of the low-pass filter, Hz."""
     filtering: str
@@ -60,6 +62,8 @@ def query_of(reading: Reading) -> dict[str, str]:
 def _text(value: Any) -> str:
     if isinstance(value, str):
         return value
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, Mapping):
         return json.dumps({name: each if isinstance(each, str) else list(each) for name, each in value.items()})
     if isinstance(value, Sequence):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
+from service.datasets.staging import POSES_HINT
 from service.foundation.errors import InvalidDataError, invalid_data
 from service.foundation.text import counted
 
@@ -238,7 +239,7 @@ def check_time_unit(t: Array, has_unit: bool, name: str) -> None:
     if has_unit or usual < CHECKS.max_step_s:
         return
     unit = "ms" if usual < 500 else "us" if usual < 500e3 else "ns"  # for rates from 2 to 1000 Hz
-    raise invalid_data(name, f"in steps of {usual:g}", _seconds(unit))
+    raise invalid_data(name, f"in steps of {usual:g}", f"{_seconds(unit)}{POSES_HINT}")
 
 
 UNITS_OF_RATIO: tuple[tuple[float, tuple[str, str] | None, tuple[str, str] | None], ...] = (

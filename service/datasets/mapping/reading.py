@@ -71,11 +71,18 @@ def read(
     if without:
         fewer = replace(options, drop_joints=(*options.drop_joints, *without))
         mapped = map_columns(table.names, table.units, table.joint_names, fewer, robot, settings.max_joints)
+    if options.read.poses:
+        mapped = replace(
+            mapped, t=(), episode=None, quantities={each: mapped.quantities[each] for each in ("q", "tau")}
+        )
     reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings, min_samples, without)
     for block in chain([] if first is None else [first], table.blocks):
         reader.add(block)
     reader.finish()
     noted = [*table.facts, *mapped.notes, *reader.notes()]
+    if options.read.poses:
+        read_rows, poses = reader.staged.rows, reader.staged.average_poses()
+        noted.append(f"{read_rows} rows are {poses} held poses: velocity and acceleration are zero")
     facts = {
         "effort": mapped.torque.effort,
         "columns": _columns(mapped, reader.staged),

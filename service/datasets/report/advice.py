@@ -44,16 +44,25 @@ class AdviceOptions:
     """Independent motions, as a share of the joints, below which joints move together."""
     standstill: float = 0.5
     """Share of samples at standstill above which there is advice."""
+    poses: float = 0.95
+    """Share of samples at standstill above which a recording consists of held poses."""
+    too_short_s: float = 10.0
+    """Duration in s below which an error can hardly be judged."""
 
 
 ADVICE = AdviceOptions()
 
 
 def collect_warnings(
-    timing: Timing, saturation: list[JointSaturation], limits: list[JointLimits], lags: list[Lag], rows: int
+    timing: Timing,
+    saturation: list[JointSaturation],
+    limits: list[JointLimits],
+    lags: list[Lag],
+    rows: int,
+    excitation: Excitation,
 ) -> list[str]:
     """Return what is wrong with a recording, one warning each. rows: of the upload."""
-    out = []
+    out = _narrow_motion(timing, excitation)
     if timing.jitter_p99 is not None and timing.jitter_p99 > ADVICE.jitter:
         out.append(texts.uneven_times(timing.jitter_p99))
     if timing.missing_rows > ADVICE.missing * rows:
@@ -69,6 +78,23 @@ def collect_warnings(
     if limited := [joint for joint in limited if joint not in clipped]:
         out.append(texts.torque_at_limit(limited))
     return out + _lag_warnings(lags)
+
+
+def _narrow_motion(timing: Timing, excitation: Excitation) -> list[str]:
+    """Return what a recording cannot show because it is no motion, motion of one joint, or short."""
+    out = []
+    moved = [each.joint for each in excitation.joints if each.span >= ADVICE.still_span]
+    if _has_poses_only(excitation):
+        out.append(texts.held_poses(excitation.standstill or 0.0))
+    elif len(moved) == 1 < len(excitation.joints):
+        out.append(texts.one_moving_joint(moved[0]))
+    if timing.duration_s is not None and timing.duration_s < ADVICE.too_short_s:
+        out.append(texts.too_short(timing.duration_s))
+    return out
+
+
+def _has_poses_only(excitation: Excitation) -> bool:
+    return (excitation.standstill or 0.0) > ADVICE.poses
 
 
 def _lag_warnings(lags: list[Lag]) -> list[str]:
@@ -102,7 +128,7 @@ def collect_advice(
     timing: Timing, excitation: Excitation, limits: list[JointLimits], noise: list[JointNoise]
 ) -> list[str]:
     """Return what to record next, most important first, with one text for all joints that share a need."""
-    joints = excitation.joints
+    joints, poses = excitation.joints, _has_poses_only(excitation)
     still = [each.joint for each in joints if each.span < ADVICE.still_span]
     moved = [each for each in joints if each.joint not in still]
     one_way = [each.joint for each in moved if min(each.forwards, each.backwards) < FRICTION.seldom]
@@ -124,20 +150,24 @@ def collect_advice(
         ([each.joint for each in moved if each.joint in slow], texts.slow_joint(ADVICE.min_used)),
         ([each.joint for each in moved if each.collinear > ADVICE.collinear], texts.REGULAR_MOTION),
     ]
+    if poses:
+        needs = [(names, need) for names, need in needs if need == texts.SMALL_RANGE]
     out = [texts.advice_for(names, need) for names, need in needs if names]
-    bodies = excitation.whole
+    bodies = None if poses else excitation.whole
     if bodies is not None and bodies.rank < bodies.parameters:
         out.append(texts.weak_excitation(bodies.parameters - bodies.rank, bodies.parameters, bodies.weakest_body))
     if noisy := [each.joint for each in noise if (each.torque_share or 0.0) > ADVICE.max_noise]:
         out.append(texts.advice_for(noisy, texts.noisy_torque(ADVICE.max_noise)))
     if smooth := [each.joint for each in noise if each.smoothed]:
         out.append(texts.advice_for(smooth, texts.SMOOTHED_TORQUE))
-    if (excitation.standstill or 0.0) > ADVICE.standstill:
+    if not poses and (excitation.standstill or 0.0) > ADVICE.standstill:
         out.append(texts.much_standstill(excitation.standstill or 0.0))
     dimensions, n = excitation.motion_dimensions, len(joints)
     if dimensions is not None and 0 < dimensions < ADVICE.min_independence * n and n - len(still) > 1:
         out.append(texts.dependent_motion(dimensions, n))
-    if timing.duration_s is not None and timing.duration_s < ADVICE.short_s:
+    if excitation.period_s is not None:
+        out.append(texts.repeated_motion(excitation.period_s))
+    if timing.duration_s is not None and ADVICE.too_short_s <= timing.duration_s < ADVICE.short_s:
         out.append(texts.short_recording(timing.duration_s))
     return out
 

@@ -77,7 +77,7 @@ def joint_excitation(
         reversals=count_reversals(dq, part),
         slow_forwards=float(np.mean(slow & (dq > SIGN_WIDTH))),
         slow_backwards=float(np.mean(slow & (dq < -SIGN_WIDTH))),
-        **judge_friction([(None, std) for std in stds], speed, spread(tau), min(forwards, backwards) < FRICTION.seldom),
+        **judge_friction([(None, std) for std in stds], speed, spread(tau), forwards, backwards),
         collinear=worst,
         collinear_term=term,
     )
@@ -87,19 +87,22 @@ Estimate = tuple[float | None, float | None]
 """A coefficient and its standard deviation, None if the data do not determine it."""
 
 
-def judge_friction(friction: Sequence[Estimate], speed: float, torque: float, one_way: bool) -> dict[str, Weight]:
+def judge_friction(
+    friction: Sequence[Estimate], speed: float, torque: float, forwards: float, backwards: float
+) -> dict[str, Weight]:
     """Judge a joint's viscous friction, Coulomb friction and offset.
 
-    speed: root mean square; torque: standard deviation; one_way: whether one direction is absent, so that Coulomb
-    friction cannot be separated from an offset.
+    speed: root mean square; torque: standard deviation; forwards, backwards: shares of the samples that move. If one
+    direction is absent, Coulomb friction cannot be separated from an offset; without motion, no friction is determined.
     """
     sizes = (float(speed), 1.0, 1.0)
     out = {
         kind: _weight(*each, size, float(torque), kind != "offset")
         for kind, each, size in zip(BASE_TERMS, friction, sizes, strict=True)
     }
-    if one_way:
-        for kind in ("coulomb", "offset"):
+    if min(forwards, backwards) < FRICTION.seldom:
+        still = max(forwards, backwards) < FRICTION.seldom
+        for kind in ("viscous", "coulomb", "offset") if still else ("coulomb", "offset"):
             out[kind] = out[kind].model_copy(update={"verdict": "not determined", "implausible": False})
     return out
 

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore import profiles
 from lipcore.data.independence import motion_dimensions
-from lipcore.data.samples import Array
+from lipcore.data.repetition import find_period
+from lipcore.data.samples import Array, Samples
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
@@ -20,7 +22,6 @@ from service.datasets.report.advice import collect_advice, collect_warnings, des
 from service.datasets.report.bodies import Bodies, Comparison, Signals, compare
 from service.datasets.report.causes import TorqueWork, find_faults
 from service.datasets.report.excitation import (
-    FRICTION,
     RigidExcitation,
     joint_excitation,
     judge_friction,
@@ -73,7 +74,7 @@ def make_report(
     candidates, best = find_candidates(names, signals) if profile is None else ((), None)
     known = profile if best is None else profiles.profile(best)
     rigid = _rigid_bodies(known, limits_of(known, names), prepared, samples, gravity)
-    excitation = _excitation(samples, rigid)
+    excitation = _excitation(samples, rigid, prepared, limits)
     reading = [note for note in noted if not note.startswith(WARNING)]
     warned = [note.removeprefix(WARNING) for note in noted if note.startswith(WARNING)]
     if profile is not None and limits is None:
@@ -105,7 +106,7 @@ def make_report(
         warnings=warned
         + _closed_brakes(raw, prepared)
         + [each.text for each in remedies]
-        + collect_warnings(times.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows),
+        + collect_warnings(times.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows, excitation),
         reading=reading,
         recipe=recipe.to_json(),
         source=source,
@@ -149,8 +150,10 @@ class _Samples:
     """Standard deviation of the torque, (n,)."""
     lags: list[schema.Lag]
     excitation: list[schema.JointExcitation]
+    rows: NDArray[np.int64]
+    """A subset of rows, (R,)."""
     motion: tuple[Array, Array, Array]
-    """q, dq and ddq at a subset of rows, (R, n) each."""
+    """q, dq and ddq at these rows, (R, n) each."""
     tau: Array
     """Torque at these rows, (R, n)."""
     work: TorqueWork
@@ -234,7 +237,17 @@ def _analyse_samples(prepared: Prepared, limits: Limits | None) -> _Samples:
                 if is_nonzero(lag) and lags.lowers_error(torque, lag.seconds or 0.0):
                     lag.improves.append(name)
     return _Samples(
-        ranges, levels.tolist(), residuals, speeds, torques, joint_lags, excitation, motion, tau, TorqueWork.of(power)
+        ranges,
+        levels.tolist(),
+        residuals,
+        speeds,
+        torques,
+        joint_lags,
+        excitation,
+        rows,
+        motion,
+        tau,
+        TorqueWork.of(power),
     )
 
 
@@ -257,15 +270,15 @@ def _rigid_bodies(
     )
 
 
-def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schema.Excitation:
+def _excitation(
+    samples: _Samples, rigid: RigidExcitation | str | None, prepared: Prepared, limits: Limits | None
+) -> schema.Excitation:
     """Return the excitation; rigid bodies, if known, replace the judgement of friction by motion alone."""
     if not isinstance(rigid, RigidExcitation):
         out = schema.Excitation(friction_beside="any motion", joints=samples.excitation, whole=None, text="")
     else:
         joints = [
-            each.model_copy(
-                update=judge_friction(friction, speed, torque, min(each.forwards, each.backwards) < FRICTION.seldom)
-            )
+            each.model_copy(update=judge_friction(friction, speed, torque, each.forwards, each.backwards))
             for each, friction, speed, torque in zip(
                 samples.excitation, rigid.friction, samples.speeds, samples.torques, strict=True
             )
@@ -274,6 +287,11 @@ def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schem
     dq = samples.motion[1]
     out.standstill = float(np.mean(np.all(np.abs(dq) < SIGN_WIDTH, axis=1)))
     out.motion_dimensions = motion_dimensions(dq)
+    if prepared.rate_hz is not None and out.motion_dimensions:
+        staged, types = prepared.staged, None if limits is None else limits.joint_types
+        episode, t = staged.read(EPISODE)[samples.rows].astype(np.int64), staged.read(TIME)[samples.rows]
+        known = Samples(staged.joint_names, t, episode, *samples.motion, samples.tau)
+        out.period_s = find_period(known, types or ("revolute",) * staged.n_joints)
     out.text = describe_excitation(out)
     return out
 

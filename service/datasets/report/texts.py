@@ -286,6 +286,39 @@ def weak_excitation(weak: int, parameters: int, weakest_body: str) -> str:
     )
 
 
+def held_poses(share: float) -> str:
+    """Report a recording of held poses."""
+    return (
+        f"The robot stands still in {percent(share)} of the samples: they are held poses. They show gravity and "
+        "stiction, but no friction and no inertia. In motion, a model answers with gravity and a large tau_std. Record "
+        "motion, too."
+    )
+
+
+def one_moving_joint(joint: str) -> str:
+    """Report a recording in which one joint moves."""
+    return (
+        f"Only {joint} moves. The torque of the other joints is learnt only near their positions, and without their "
+        "friction. Move all joints, or keep one: `joints` names it."
+    )
+
+
+def too_short(seconds: float) -> str:
+    """Report a recording that is too short to judge an error."""
+    return (
+        f"The recording lasts {seconds:.3g} s. A held-out part of it would say little about the error, so a version of "
+        "it may not serve by itself. Record several minutes."
+    )
+
+
+def repeated_motion(period: float) -> str:
+    """Advise on motion that repeats itself. period: s."""
+    return (
+        f"The motion repeats every {period:.3g} s. Errors on other motion may be larger than on held-out parts of it. "
+        "Record other motion, too."
+    )
+
+
 def much_standstill(share: float) -> str:
     """Advise on standstill in a large share of the samples."""
     return (

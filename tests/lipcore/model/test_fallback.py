@@ -18,7 +18,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.transfer import Revision, consolidate
 from lipcore.posterior.evaluator import QUERIES
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Simulation, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, as_rows, train_from_geometry
 from tests.lipcore.model.test_declared_payload import BODY, declare_payload
@@ -63,8 +63,11 @@ def dense(model: TorqueModel, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     still = replace(motion, dq=np.zeros_like(motion.dq), ddq=np.zeros_like(motion.ddq))
     mean, variance, _ = condition(model, motion, motion)
     static, uncertain, payload = condition(model, still, motion)
-    share, own = (np.clip((each / usual - 1) / 2, 0, 1) for each in (variance, uncertain))
-    harmless = static + own * (centre + payload - static)
+    rest, least, _ = condition(model, still, still)
+    share, own, at_rest = (np.clip((each / usual - 1) / 2, 0, 1) for each in (variance, uncertain, least))
+    stood = np.abs([model.training_range["dq"][end] for end in ("min", "max")]).max(0) < 0.02
+    at_rest[:, ~stood] = 1.0
+    harmless = static + own * (rest + at_rest * (centre + payload - rest) - static)
     return mean + share * (harmless - mean), share
 
 
@@ -210,3 +213,23 @@ def test_learning_ends_the_fallback_and_changes_keep_it_off(case: Case) -> None:
             assert answer.fallback is None
             np.testing.assert_allclose(answer.tau, predict(learnt, case.fast).tau, rtol=1e-6, atol=1e-6)
     assert np.array_equal(predict(Revision.of(online.model()).apply(model), case.fast).tau, after.tau)
+
+
+def test_joint_that_stood_still_falls_back_to_gravity() -> None:
+    """Held poses show gravity; in motion, the answer is gravity and its standard deviation is large."""
+    robot, rng = load_robot("double-pendulum"), np.random.default_rng(2)
+    q = rng.uniform(-2.0, 2.0, (80, 2))
+    still = np.zeros_like(q)
+    tau = inverse_dynamics(robot, q, still, still) + rng.normal(0.0, 0.02, q.shape)
+    samples = Samples(robot.joint_names, np.arange(80.0), np.arange(80), q, still, still, tau)
+    geometry = Geometry.from_robot(RigidBody.from_profile(robot.name, robot.joint_names, robot.joint_types))
+    model = train_from_geometry(geometry, robot, samples, FitOptions(device="cpu"))
+    posture, fast = rng.uniform(-2.0, 2.0, (20, 2)), np.full((20, 2), 2.0)
+    gravity, answer = inverse_dynamics(robot, posture, 0 * fast, 0 * fast), model.predict(posture, fast, 0 * fast)
+    assert (answer.fallback.share > 0.5).all()
+    np.testing.assert_allclose(answer.tau, gravity, atol=0.1)
+    assert (answer.tau_std > np.std(tau, axis=0)).all()
+    expected, _ = dense(model, samples.motion()[:20])
+    np.testing.assert_allclose(model.predict(q[:20], still[:20], still[:20]).tau, expected, atol=1e-9)
+    motion = replace(samples.motion()[:20], dq=fast)
+    np.testing.assert_allclose(model.predict(q[:20], fast, still[:20]).tau, dense(model, motion)[0], rtol=1e-6)

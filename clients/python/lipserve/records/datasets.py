@@ -190,6 +190,7 @@ class Excitation(Record, frozen=True, kw_only=True):
         unknown parameters. `any motion`: any smooth function of the motion, which leaves friction less certain
     standstill: Share of samples in which no joint moves
     motion_dimensions: Number of independent motions: 1 if all joints move together, n if each moves on its own
+    period_s: Time after which the motion repeats itself, s; null if it does not
     text: Summary in words
     """
 
@@ -197,6 +198,7 @@ class Excitation(Record, frozen=True, kw_only=True):
     joints: list[JointExcitation]
     standstill: float | None = None
     motion_dimensions: float | None = None
+    period_s: float | None = None
     whole: WholeExcitation | None
     text: str
 

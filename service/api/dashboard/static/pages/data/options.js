@@ -30,6 +30,7 @@ export function uploadOptions() {
     topic: textInput("topic", "/joint_states"),
     column_names: textInput("column_names", "t,q1..q7,tau1..tau7"),
     dt: numberInput("dt", "from the file", "0.000001", "100"),
+    poses: select("poses", [["", "motion"], ["true", "held poses, one a row"]]),
     delimiter: select("delimiter", [["", "auto-detect"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]]),
     filtering: select("filtering", [
       ["", "only if signals are derived (default)"],
@@ -110,6 +111,7 @@ export function uploadOptions() {
       field("Torque convention", inputs.torque_convention),
       field("Topic", inputs.topic, "Required if several topics of a bag can be read. Topics separated by commas are merged by time."),
       field("Time from row to row, s", inputs.dt, "For files without times."),
+      field("Rows", inputs.poses, "Held poses need no times and velocities."),
       field("Column names", inputs.column_names, "For text without a header."),
       field("Delimiter", inputs.delimiter, "For CSV files."),
     ),
