@@ -1,7 +1,9 @@
 """Settings of the test suite: the tests of `make test`, and which tests share a process in parallel runs."""
 
+import ast
 import gc
 import re
+import threading
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,17 @@ from hypothesis import settings
 
 from tests import ROOT
 from tests.choosing import mark_repetitions
+
+_parse, _parsing = ast.parse, threading.RLock()
+
+
+def _parse_alone(*args: Any, **options: Any) -> ast.AST:
+    """Parse as `ast.parse` does: in Python 3.11, two threads that parse at a time may fail (gh-106905)."""
+    with _parsing:
+        return _parse(*args, **options)
+
+
+ast.parse = _parse_alone  # type: ignore[assignment]
 
 # derandomised, so that a failure on one machine is a failure on every machine
 settings.register_profile("lipserve", derandomize=True, deadline=None, max_examples=10)

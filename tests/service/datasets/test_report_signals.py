@@ -10,7 +10,7 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 
 from lipcore.data.signals import noise_level
 from lipcore.preparation.recipe import Recipe
-from service.contract.datasets import Lag, Timing
+from service.contract.datasets import Excitation, Lag, Timing
 from service.datasets.report.advice import collect_warnings
 from service.datasets.report.fit import Fit
 from service.datasets.report.lag import shifts
@@ -157,7 +157,8 @@ def test_lag_that_shifting_does_not_correct_gives_no_warning() -> None:
 
     def reply(common: Lag, *joints: list[str]) -> list[str]:
         each = [Lag(joint=f"j{k}", improves=improves, **certain) for k, improves in enumerate(joints)]
-        return collect_warnings(timing, [], [], [common, *each], 1000)
+        moving = Excitation(friction_beside="any motion", joints=[], standstill=0.0, whole=None, text="")
+        return collect_warnings(timing, [], [], [common, *each], 1000, moving)
 
     def shared(*improves: str) -> Lag:
         return Lag(joint=None, improves=list(improves), **certain)
