@@ -111,7 +111,7 @@ class UploadQuery(BaseModel):
     )
     poses: bool = Field(
         False,
-        description="Whether each row is a held pose, without times and velocities. Consecutive equal poses are averaged",
+        description="Whether each row is a held pose, without times and velocities. Equal ones in a row are averaged",
     )
     cutoff: float = Field(CUTOFF, gt=0, le=1000, allow_inf_nan=False, description="Cut-off of the low-pass, Hz")
     filtering: Filtering = Field(

@@ -51,7 +51,12 @@ def test_rows_of_the_same_pose_are_averaged(api):
 
 
 def moving(t, both=True):
-    q = np.column_stack([np.sin(t) + 0.3 * np.sin(7**0.5 * t), 0.8 * np.sin(3**0.5 * t + 1) * both + 0.2 + 1e-4 * RNG.normal(size=len(t))])
+    q = np.column_stack(
+        [
+            np.sin(t) + 0.3 * np.sin(7**0.5 * t),
+            0.8 * np.sin(3**0.5 * t + 1) * both + 0.2 + 1e-4 * RNG.normal(size=len(t)),
+        ]
+    )
     return table(q, np.column_stack([30 * np.cos(q[:, 0]), 9 * np.cos(q.sum(1))]), t)
 
 
