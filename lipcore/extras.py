@@ -33,7 +33,7 @@ class Extra:
 
 EXTRAS = {
     "train": Extra("train the estimators se, gip and lse, on a GPU if there is one", ("torch",)),
-    "robots": Extra("use URDFs", ("pinocchio",)),
+    "robots": Extra("use URDFs", ("pinocchio", "xacro")),
     "sim": Extra("simulate robots and know them by name", ("pinocchio",), ROBOTS_DATA),
     "ingest": Extra(
         "read CSV, Parquet, HDF5, Excel, LeRobot and bags (NPZ and JSON need no extra)",

@@ -58,7 +58,12 @@ def show(robot: Robot, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
 
 @app.command()
 def add(
-    path: Annotated[Path, typer.Argument(help="A .urdf file, or MuJoCo's .xml.", exists=True, dir_okay=False)],
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help="A .urdf, .xacro or MuJoCo .xml file, or the zip of its folder.", exists=True, dir_okay=False
+        ),
+    ],
     scale: Annotated[
         list[str] | None,
         typer.Option(help="Factor to m, kg or kg·m²: length=0.001 for mm, inertia=1e-9 for g·mm². Repeatable."),
@@ -67,8 +72,8 @@ def add(
     as_json: Json = False,
 ) -> None:
     """Upload a URDF for use with recordings and training."""
-    if path.suffix not in (".urdf", ".xml"):
-        raise CommandError(f"{str(path)!r} is not a .urdf file, or .xml in MuJoCo's format")
+    if path.suffix not in (".urdf", ".xacro", ".xml", ".zip"):
+        raise CommandError(f"{str(path)!r} is no .urdf, .xacro or .zip file, or .xml in MuJoCo's format")
     factors = pairs("--scale", [part for each in scale or () for part in each.split(",")])
     with connected(url) as client:
         robot = client.upload_robot(path, scale={name: float(text) for name, text in factors.items()} or None)

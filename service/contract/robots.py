@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, Field
 
 from lipcore.vocabulary import EffortMeaning, JointType
-from service.foundation.fields import upload_body
+from service.foundation.fields import BINARY, upload_body
 
 
 class RobotJoint(BaseModel):
@@ -69,7 +69,8 @@ class ProfileList(BaseModel):
 
 
 UPLOAD_BODY = upload_body(
-    "A URDF with a fixed base. Meshes are not needed. Joints are matched to the data by name.",
+    "A robot with a fixed base: a URDF, a xacro, MuJoCo's MJCF, or the zip of a folder with one of them and the files "
+    "that it includes. Meshes are not needed. Joints are matched to the data by name.",
     {
         "application/xml": {
             "schema": {"type": "string"},
@@ -79,6 +80,7 @@ UPLOAD_BODY = upload_body(
             '<axis xyz="0 1 0"/></joint></robot>',
         },
         "text/xml": {"schema": {"type": "string"}},
+        "application/zip": {"schema": BINARY},
     },
-    "A .urdf file",
+    "A .urdf, .xacro, .xml or .zip file",
 )

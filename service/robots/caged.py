@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
+from lipcore.extras import import_extra
 from lipcore.profiles.profile import read_limits
 from lipcore.robots import urdf_text, urdf_units
 from lipcore.robots.library import pinocchio
@@ -13,12 +16,14 @@ from lipcore.robots.mjcf import convert_mjcf, is_mjcf
 from lipcore.robots.urdf import Description, describe
 from lipcore.robots.urdf_text import UrdfError
 from lipcore.robots.urdf_units import Scale
+from lipcore.robots.xacro_files import expand_xacro, is_xacro, unpack_description
 from service.foundation.errors import InvalidDataError, problem
 
 
 def warm() -> None:
     """Import the URDF reader; raise MissingExtraError if it is not installed."""
     pinocchio()
+    import_extra("xacro.substitution_args", "robots")
 
 
 @dataclass(frozen=True)
@@ -29,14 +34,25 @@ class ReadUrdf:
     description: Description
 
 
-def read_urdf(urdf: str, scale: dict[str, float], folder: Path) -> ReadUrdf:
-    """Return a URDF, or an MJCF as URDF, in SI units. scale: factors of its quantities; folder: for temporary files.
+def read_robot(upload: Path, scale: dict[str, float], folder: Path, max_bytes: int) -> ReadUrdf:
+    """Return a robot as URDF in SI units: a URDF, MJCF or xacro, or a zip of a folder with one of them.
 
-    Raise InvalidDataError naming the error in it.
+    scale: factors of its quantities; folder: for temporary files; max_bytes: of the files in a zip. Raise
+    InvalidDataError naming the error in it.
     """
     try:
+        file, files = upload, folder / "files"
+        files.mkdir()
+        if zipfile.is_zipfile(upload):
+            file = unpack_description(upload, files, max_bytes)
+        else:
+            file = files / "robot.xacro"
+            shutil.copyfile(upload, file)
+        urdf = _decode(file.read_bytes())
         if is_mjcf(urdf):
             urdf = convert_mjcf(urdf, folder)
+        elif is_xacro(urdf):
+            urdf = expand_xacro(file, files)
         if scale:
             urdf = urdf_units.scaled(urdf_text.read_urdf(urdf).plain, cast(Scale, scale))
         described = describe(urdf)
@@ -44,6 +60,13 @@ def read_urdf(urdf: str, scale: dict[str, float], folder: Path) -> ReadUrdf:
     except UrdfError as error:
         raise invalid_urdf(str(error)) from None
     return ReadUrdf(urdf, described)
+
+
+def _decode(content: bytes) -> str:
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UrdfError(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
 
 
 def invalid_urdf(message: str) -> InvalidDataError:

@@ -37,18 +37,17 @@ from service.storage.rows import Page, read_page
 
 
 def add(database: Database, content: bytes, name: str | None, scale: str | None, settings: Settings) -> Robot:
-    """Check a URDF and store it in SI units; raise InvalidDataError naming the error in it.
+    """Check a robot and store it as URDF in SI units; raise InvalidDataError naming the error in it.
 
     scale: factors of its quantities, such as `length=0.001,inertia=1e-9`; raise InvalidRequestError for another text.
     """
-    try:
-        urdf = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise invalid_urdf(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
-    function, factors = "service.robots.caged:read_urdf", _factors(scale)
+    function, factors = "service.robots.caged:read_robot", _factors(scale)
     with TemporaryDirectory(dir=settings.home) as given:
         folder = Path(given)
-        read = cage.run(function, ReadUrdf, urdf, factors, folder, settings=settings, folder=folder, field="urdf")
+        upload = folder / "upload"
+        upload.write_bytes(content)
+        arguments = upload, factors, folder, settings.max_unpacked_bytes
+        read = cage.run(function, ReadUrdf, *arguments, settings=settings, folder=folder, field="urdf")
     urdf, described = read.urdf, read.description
     row = RobotRow(
         id=new_id("urdf"),

@@ -25,7 +25,7 @@ from service.datasets.options import UploadOptions
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.models.archive_reading import try_out
-from service.robots.caged import read_urdf
+from service.robots.caged import read_robot
 from service.storage.disk import Usage
 
 MiB = 1024 * 1024
@@ -78,11 +78,12 @@ def _recording(kind: str) -> Callable[[bytes], None]:
 
 
 def _urdf(data: bytes) -> None:
-    text = data.decode("utf-8-sig", "replace")
-    with tempfile.TemporaryDirectory() as folder:
-        read_urdf(text, {}, Path(folder))
-        read_urdf(text, {"length": 0.5, "mass": 2.0, "inertia": 0.1}, Path(folder))
-    from_urdf(text, "fuzzed")  # a URDF that can be read can also be used
+    for scale in ({}, {"length": 0.5, "mass": 2.0, "inertia": 0.1}):
+        with tempfile.TemporaryDirectory() as folder:
+            upload = Path(folder) / "upload"
+            upload.write_bytes(data)
+            robot = read_robot(upload, scale, Path(folder), MiB)
+        from_urdf(robot.urdf, "fuzzed")  # a robot that can be read can also be used
 
 
 def _archive(data: bytes) -> None:

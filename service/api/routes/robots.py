@@ -48,11 +48,14 @@ async def upload(
         Query(max_length=100, description="Factors to SI units: `length=0.001,inertia=1e-9` for mm and g·mm²"),
     ] = None,
 ) -> Robot:
-    """Check a URDF and store it as a robot; MuJoCo's MJCF is converted. Files that it refers to are not opened.
+    """Check a URDF and store it as a robot; MJCF is converted and xacro expanded. Meshes are not opened.
 
     A wrong URDF is rejected: `detail` names what is wrong.
     """
-    kinds = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
+    kinds = Kinds(
+        dict.fromkeys(("application/xml", "text/xml", "application/zip"), "urdf"),
+        dict.fromkeys((".urdf", ".xml", ".xacro", ".zip"), "urdf"),
+    )
     _, content = await receive(request, kinds)
     await to_thread.run_sync(storage.disk.reserve, len(content))
     robot = await to_thread.run_sync(store.add, storage.database, content, name, scale, storage.settings)

@@ -1,6 +1,8 @@
 """Robots: upload of URDFs, rejected files, and training with rigid bodies."""
 
 import hashlib
+import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -35,8 +37,8 @@ def post_robot(api, body, media_type="application/xml", **params):
     return api.post("/v1/robots", content=body, headers={"content-type": media_type}, params=params)
 
 
-def add_robot(api, body, **params):
-    answer = post_robot(api, body, **params)
+def add_robot(api, body, media_type="application/xml", **params):
+    answer = post_robot(api, body, media_type, **params)
     assert answer.status_code == 201, answer.text
     return answer.json()
 
@@ -264,3 +266,23 @@ def test_units_of_a_urdf_are_named_and_scaled(api, arm, system):
 @pytest.mark.parametrize("scale", ["length", "length=x", "width=0.1", "mass=0", "mass=nan"])
 def test_wrong_scale_is_rejected(api, scale):
     assert post_robot(api, urdf(), scale=scale).status_code == 422
+
+
+def test_xacro_and_a_zip_of_its_folder_are_expanded(api):
+    plain = urdf().decode()
+    inside, end = (
+        plain.split(">", 1)[1].rpartition("</robot>")[0],
+        '<xacro:property name="p" value="${2 * pi}"/></robot>',
+    )
+    start = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr("arm/arm.urdf.xacro", f'{start}<xacro:include filename="parts.xacro"/>{end}')
+        archive.writestr("arm/parts.xacro", f"{start}{inside}</robot>")
+    joints = add_robot(api, plain.encode())["joints"]
+    assert add_robot(api, f"{start}{inside}{end}".encode())["joints"] == joints
+    assert add_robot(api, out.getvalue(), media_type="application/zip")["joints"] == joints
+    wrong = f"{start}{inside}<link name=\"${{open('/etc/passwd').read()}}\"/></robot>"
+    message = error(post_robot(api, wrong.encode()), 422, "invalid_data")["message"]
+    assert "xacro cannot expand robot.xacro" in message
+    assert "xacro robot.urdf.xacro > robot.urdf" in message

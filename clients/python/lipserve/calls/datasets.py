@@ -135,14 +135,14 @@ def delete_dataset(_route: Route, dataset: str) -> Call[None]:
 def upload_robot(
     _route: Route, path: Path | str, name: str | None = None, scale: Mapping[str, float] | None = None
 ) -> Call[Robot]:
-    """Upload a URDF.
+    """Upload a robot.
 
     Args:
-        path: The file.
+        path: A URDF, a xacro, MuJoCo's MJCF, or the zip of a folder with one of them and the files that it includes.
         name: Name of the robot.
         scale: Factors of `length`, `mass` and `inertia` to m, kg and kg·m², for a URDF in other units.
     """
-    headers = {"content-type": "application/xml"}
+    headers = {"content-type": "application/zip" if Path(path).suffix == ".zip" else "application/xml"}
     factors = None if scale is None else ",".join(f"{quantity}={factor:g}" for quantity, factor in scale.items())
     return _route(record(Robot), names={}, params=given(name=name, scale=factors), headers=headers, file=Path(path))
 
