@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from lipcore.robots.urdf_text import UrdfError
 MAX_FILES = 2000
 ENDINGS = (".xacro", ".urdf", ".xml")
 _INCLUDE = re.compile(r"""<xacro:include\b[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
+_ARGUMENT = re.compile(r"""<xacro:arg\b[^>]*\bname\s*=\s*["'](\w+)["']""")
 _TODO = "Expand it where its packages are installed: xacro robot.urdf.xacro > robot.urdf"
 
 
@@ -49,7 +50,7 @@ def unpack_description(archive: Path, folder: Path, max_bytes: int) -> Path:
     return robots[0]
 
 
-def expand_xacro(file: Path, folder: Path) -> str:
+def expand_xacro(file: Path, folder: Path, arguments: Mapping[str, str]) -> str:
     """Return the URDF of a xacro. folder: contains all files that it may include. Raise UrdfError."""
     xacro = import_extra("xacro", "robots")
     for path in folder.rglob("*"):
@@ -57,13 +58,17 @@ def expand_xacro(file: Path, folder: Path) -> str:
             raise UrdfError(f"{path.name} has a document type, which is not read")
     try:
         with _confined(xacro, folder):
-            document = xacro.process_file(str(file))
+            document = xacro.process_file(str(file), mappings=dict(arguments))
             return str(document.documentElement.toxml())
     except UrdfError:
         raise
     except Exception as error:  # of expressions and macros, which come with the file
         reason = str(error).strip() or type(error).__name__
-        raise UrdfError(f"xacro cannot expand {file.name}: {reason[:300].replace(str(folder), '')}. {_TODO}") from None
+        names = {name for path in folder.rglob("*") if path.is_file() for name in _ARGUMENT.findall(_read(path))}
+        listed = f"Its arguments are {', '.join(sorted(names))}: set xacro={min(names)}=…. Or: " if names else ""
+        raise UrdfError(
+            f"xacro cannot expand {file.name}: {reason[:300].replace(str(folder), '')}. {listed}{_TODO}"
+        ) from None
 
 
 @contextmanager

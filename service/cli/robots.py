@@ -68,15 +68,19 @@ def add(
         list[str] | None,
         typer.Option(help="Factor to m, kg or kg·m²: length=0.001 for mm, inertia=1e-9 for g·mm². Repeatable."),
     ] = None,
+    xacro: Annotated[
+        list[str] | None, typer.Option(help="Argument of a xacro, such as ur_type=ur5e. Repeatable.")
+    ] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Upload a URDF for use with recordings and training."""
+    """Upload a robot for use with recordings and training."""
     if path.suffix not in (".urdf", ".xacro", ".xml", ".zip"):
         raise CommandError(f"{str(path)!r} is no .urdf, .xacro or .zip file, or .xml in MuJoCo's format")
     factors = pairs("--scale", [part for each in scale or () for part in each.split(",")])
     with connected(url) as client:
-        robot = client.upload_robot(path, scale={name: float(text) for name, text in factors.items()} or None)
+        units = {name: float(text) for name, text in factors.items()}
+        robot = client.upload_robot(path, scale=units or None, xacro=pairs("--xacro", xacro) or None)
     print_result(robot, as_json, f"{path.name} uploaded as {robot.id}: `lipserve train … --robot {robot.id}`")
 
 

@@ -14,7 +14,7 @@ FLAGS = {
     **{name: f"--{name}" for name in ("robot", "effort", "topic", "delimiter", "cutoff", "filtering", "rate", "gap")},
     **{name: f"--{name}" for name in ("trim", "joints", "form", "model", "estimator", "base", "promotion")},
     **{"drop_joints": "--drop", "columns": "--column", "units": "--unit", "options": "--option"},
-    **{"column_names": "--columns", "dt": "--dt", "poses": "--poses", "scale": "--scale"},
+    **{"column_names": "--columns", "dt": "--dt", "poses": "--poses", "scale": "--scale", "xacro": "--xacro"},
     **{"holdout.share": "--hold-out", "holdout.kind": "--hold-out-by", "holdout.only": "--hold-out-only"},
 }
 """Command line options by API field."""

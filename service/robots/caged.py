@@ -34,11 +34,11 @@ class ReadUrdf:
     description: Description
 
 
-def read_robot(upload: Path, scale: dict[str, float], folder: Path, max_bytes: int) -> ReadUrdf:
+def read_robot(upload: Path, scale: dict[str, float], xacro: dict[str, str], folder: Path, max_bytes: int) -> ReadUrdf:
     """Return a robot as URDF in SI units: a URDF, MJCF or xacro, or a zip of a folder with one of them.
 
-    scale: factors of its quantities; folder: for temporary files; max_bytes: of the files in a zip. Raise
-    InvalidDataError naming the error in it.
+    scale: factors of its quantities; xacro: arguments; folder: for temporary files; max_bytes: of the files in a zip.
+    Raise InvalidDataError naming the error in it.
     """
     try:
         file, files = upload, folder / "files"
@@ -52,7 +52,7 @@ def read_robot(upload: Path, scale: dict[str, float], folder: Path, max_bytes: i
         if is_mjcf(urdf):
             urdf = convert_mjcf(urdf, folder)
         elif is_xacro(urdf):
-            urdf = expand_xacro(file, files)
+            urdf = expand_xacro(file, files, xacro)
         if scale:
             urdf = urdf_units.scaled(urdf_text.read_urdf(urdf).plain, cast(Scale, scale))
         described = describe(urdf)

@@ -36,17 +36,20 @@ from service.storage.files import new_id
 from service.storage.rows import Page, read_page
 
 
-def add(database: Database, content: bytes, name: str | None, scale: str | None, settings: Settings) -> Robot:
+def add(
+    database: Database, content: bytes, name: str | None, scale: str | None, xacro: str | None, settings: Settings
+) -> Robot:
     """Check a robot and store it as URDF in SI units; raise InvalidDataError naming the error in it.
 
-    scale: factors of its quantities, such as `length=0.001,inertia=1e-9`; raise InvalidRequestError for another text.
+    scale: factors of its quantities, such as `length=0.001,inertia=1e-9`; xacro: arguments, such as `ur_type=ur5e`.
+    Raise InvalidRequestError for another text.
     """
     function, factors = "service.robots.caged:read_robot", _factors(scale)
     with TemporaryDirectory(dir=settings.home) as given:
         folder = Path(given)
         upload = folder / "upload"
         upload.write_bytes(content)
-        arguments = upload, factors, folder, settings.max_unpacked_bytes
+        arguments = upload, factors, _pairs("xacro", xacro), folder, settings.max_unpacked_bytes
         read = cage.run(function, ReadUrdf, *arguments, settings=settings, folder=folder, field="urdf")
     urdf, described = read.urdf, read.description
     row = RobotRow(
@@ -64,16 +67,18 @@ def add(database: Database, content: bytes, name: str | None, scale: str | None,
 
 def _factors(scale: str | None) -> dict[str, float]:
     """Return the factors of a text such as `length=0.001,inertia=1e-9`."""
-    out: dict[str, float] = {}
-    for part in [] if scale is None else scale.split(","):
-        quantity, _, factor = part.partition("=")
-        try:
-            out[quantity.strip()] = float(factor)
-        except ValueError:
-            raise invalid_request(
-                "scale", scale, "factors to m, kg and kg·m², such as length=0.001,mass=0.001"
-            ) from None
-    return out
+    try:
+        return {quantity: float(factor) for quantity, factor in _pairs("scale", scale).items()}
+    except ValueError:
+        raise invalid_request("scale", scale, "factors to m, kg and kg·m², such as length=0.001,mass=0.001") from None
+
+
+def _pairs(field: str, text: str | None) -> dict[str, str]:
+    """Return the values by name of a text such as `a=1,b=2`; raise InvalidRequestError."""
+    parts = [part.partition("=") for part in ([] if text is None else text.split(","))]
+    if not all(name.strip() and equals for name, equals, _ in parts):
+        raise invalid_request(field, text, "names with values, such as a=1,b=2")
+    return {name.strip(): value.strip() for name, _, value in parts}
 
 
 def show(database: Database, robot: str) -> Robot:

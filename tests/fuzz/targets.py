@@ -82,7 +82,7 @@ def _urdf(data: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder:
             upload = Path(folder) / "upload"
             upload.write_bytes(data)
-            robot = read_robot(upload, scale, Path(folder), MiB)
+            robot = read_robot(upload, scale, {}, Path(folder), MiB)
         from_urdf(robot.urdf, "fuzzed")  # a robot that can be read can also be used
 
 

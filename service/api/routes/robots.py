@@ -47,6 +47,9 @@ async def upload(
         str | None,
         Query(max_length=100, description="Factors to SI units: `length=0.001,inertia=1e-9` for mm and g·mm²"),
     ] = None,
+    xacro: Annotated[
+        str | None, Query(max_length=1000, description="Arguments of a xacro: `ur_type=ur5e,name=ur`")
+    ] = None,
 ) -> Robot:
     """Check a URDF and store it as a robot; MJCF is converted and xacro expanded. Meshes are not opened.
 
@@ -58,7 +61,7 @@ async def upload(
     )
     _, content = await receive(request, kinds)
     await to_thread.run_sync(storage.disk.reserve, len(content))
-    robot = await to_thread.run_sync(store.add, storage.database, content, name, scale, storage.settings)
+    robot = await to_thread.run_sync(store.add, storage.database, content, name, scale, xacro, storage.settings)
     response.headers["Location"] = f"/v1/robots/{robot.id}"
     return robot
 

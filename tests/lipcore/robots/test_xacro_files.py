@@ -28,7 +28,7 @@ def expand(folder, files, main="arm.urdf.xacro"):
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
-    return expand_xacro(folder / main, folder)
+    return expand_xacro(folder / main, folder, {})
 
 
 def check(urdf):
@@ -56,7 +56,20 @@ def test_included_files_of_a_zip_are_found(tmp_path, include):
     file = unpack_description(tmp_path / "a.zip", folder, 1 << 20)
     assert file.name == "arm.urdf.xacro"
     assert not list(folder.rglob("*.stl"))
-    check(expand_xacro(file, folder))
+    check(expand_xacro(file, folder, {}))
+
+
+def test_arguments_are_set_and_named_if_they_are_wrong(tmp_path):
+    """As in the description of UR's arms: a folder of numbers for each type."""
+    yaml = "<xacro:property name='numbers' value=\"${xacro.load_yaml('config/$(arg ur_type)/mass.yaml')}\"/>"
+    body = ARM.replace("INCLUDE", LINK + yaml + '<xacro:arg name="ur_type" default="ur5x"/>')
+    files = {
+        "arm.urdf.xacro": robot(body.replace("${2 * 3}", "${numbers['upper']}")),
+        "config/ur5e/mass.yaml": "upper: 6",
+    }
+    with pytest.raises(UrdfError, match="Its arguments are ur_type: set xacro=ur_type="):
+        expand(tmp_path, files)
+    check(expand_xacro(tmp_path / "arm.urdf.xacro", tmp_path, {"ur_type": "ur5e"}))
 
 
 SECRET = '<xacro:include filename="../secret.xacro"/>'

@@ -133,7 +133,11 @@ def delete_dataset(_route: Route, dataset: str) -> Call[None]:
 
 @route("POST", "/v1/robots")
 def upload_robot(
-    _route: Route, path: Path | str, name: str | None = None, scale: Mapping[str, float] | None = None
+    _route: Route,
+    path: Path | str,
+    name: str | None = None,
+    scale: Mapping[str, float] | None = None,
+    xacro: Mapping[str, str] | None = None,
 ) -> Call[Robot]:
     """Upload a robot.
 
@@ -141,10 +145,13 @@ def upload_robot(
         path: A URDF, a xacro, MuJoCo's MJCF, or the zip of a folder with one of them and the files that it includes.
         name: Name of the robot.
         scale: Factors of `length`, `mass` and `inertia` to m, kg and kg·m², for a URDF in other units.
+        xacro: Arguments of a xacro by name.
     """
     headers = {"content-type": "application/zip" if Path(path).suffix == ".zip" else "application/xml"}
     factors = None if scale is None else ",".join(f"{quantity}={factor:g}" for quantity, factor in scale.items())
-    return _route(record(Robot), names={}, params=given(name=name, scale=factors), headers=headers, file=Path(path))
+    arguments = None if xacro is None else ",".join(f"{argument}={value}" for argument, value in xacro.items())
+    params = given(name=name, scale=factors, xacro=arguments)
+    return _route(record(Robot), names={}, params=params, headers=headers, file=Path(path))
 
 
 @route("GET", "/v1/robots")
