@@ -62,7 +62,7 @@ screenshots: install-all
 	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/system/browser/test_journey.py tests/system/browser/test_arm.py tests/system/browser/test_payload.py
 
 # fuzzes the readers of uploads with Atheris, each for SECONDS; findings go to build/fuzz
-FUZZ := csv json json_lines npz parquet feather hdf5 npy xlsx gzip rosbag1 rosbag2 mcap zip urdf archive manifest tensors
+FUZZ := csv json json_lines npz parquet feather hdf5 npy xlsx gzip yaml rosbag1 rosbag2 mcap zip urdf archive manifest tensors
 SECONDS ?= 60
 fuzz: install-all
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e '.[fuzz]'

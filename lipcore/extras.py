@@ -37,7 +37,7 @@ EXTRAS = {
     "sim": Extra("simulate robots and know them by name", ("pinocchio",), ROBOTS_DATA),
     "ingest": Extra(
         "read CSV, Parquet, HDF5, Excel, LeRobot and bags (NPZ and JSON need no extra)",
-        ("pyarrow", "clevercsv", "chardet", "dateutil", "h5py", "openpyxl", "rosbags", "mcap", "mcap_protobuf"),
+        ("pyarrow", "clevercsv", "chardet", "dateutil", "h5py", "openpyxl", "rosbags", "mcap", "mcap_protobuf", "yaml"),
     ),
     "cluster": Extra("share PostgreSQL, S3 and a Dask cluster", ("psycopg", "s3fs", "distributed")),
     "grpc": Extra("serve over gRPC", ("grpc", "google.protobuf")),

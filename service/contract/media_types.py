@@ -17,6 +17,7 @@ MEDIA_TYPES = {
     "application/x-matlab-data": "mat",
     "application/x-npy": "npy",
     "application/vnd.openxmlformats-officedocument.spreadsheetml.sheet": "xlsx",
+    "application/yaml": "yaml",
     "application/gzip": "gzip",
     "application/zstd": "zstd",
 }
@@ -42,6 +43,8 @@ SUFFIXES = {
     ".mat": "mat",
     ".npy": "npy",
     ".xlsx": "xlsx",
+    ".yaml": "yaml",
+    ".yml": "yaml",
     ".gz": "gzip",
     ".zst": "zstd",
 }

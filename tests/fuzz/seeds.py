@@ -76,6 +76,7 @@ def seeds() -> Iterator[tuple[str, bytes]]:
         yield "zip", bags.zipped(folder / "two", folder / "two.zip").read_bytes()
         for compression in ("NONE", "ZSTD"):
             yield "mcap", bags.write_mcap(folder / f"{compression}.mcap", written, compression).read_bytes()
+        yield "yaml", messages.echo(messages.NUMBERS[:12].round(3)).encode()
         for write in (messages.write_json, messages.write_protobuf):
             yield "mcap", write(folder / f"{write.__name__}.mcap", messages.NUMBERS[:12]).read_bytes()
     texts = {"positions.txt": _text("q"), "velocities.txt": _text("dq"), "torques.txt": _text("tau")}

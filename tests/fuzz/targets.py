@@ -98,7 +98,14 @@ def _tensors(data: bytes) -> None:
 
 
 KINDS = ("csv", "json", "json_lines", "npz", "parquet", "rosbag1", "rosbag2", "mcap", "zip")
-KINDS += ("feather", "hdf5", "npy", "xlsx", "gzip")  # SciPy crashes on damaged `mat` files, in the confined process
+KINDS += (
+    "feather",
+    "hdf5",
+    "npy",
+    "xlsx",
+    "gzip",
+    "yaml",
+)  # SciPy crashes on damaged `mat` files, in the confined process
 TARGETS: dict[str, Callable[[bytes], object]] = {
     **{kind: _recording(kind) for kind in KINDS},
     "urdf": _urdf,

@@ -35,6 +35,7 @@ KINDS = {
     "rosbag1": "a ROS 1 bag",
     "rosbag2": "a ROS 2 bag",
     "mcap": "MCAP",
+    "yaml": "YAML of `ros2 topic echo`",
     "feather": "Feather",
     "hdf5": "HDF5",
     "mat": "a MATLAB file",
@@ -125,7 +126,7 @@ def _sniff_zip(path: Path) -> str | None:
 
 
 def _sniff_text(head: bytes) -> str | None:
-    """Return "json", "json_lines" or "csv" if the head of a file is such text."""
+    """Return "json", "json_lines", "yaml" or "csv" if the head of a file is such text."""
     found = decode_head(head, len(head) < HEAD_BYTES)
     text = "" if found is None else found[1].lstrip()
     if not text or "\0" in text or text[0] == "<":
@@ -141,6 +142,8 @@ def _sniff_text(head: bytes) -> str | None:
         if rest.strip():
             return "json_lines"
         return "json" if any(isinstance(value, list | dict) for value in row.values()) else "json_lines"
+    if re.match(r"[A-Za-z_]\w*:\s", text) and re.search(r"(?m)^---\s*$", text):
+        return "yaml"
     lines = (line for line in text.splitlines() if line.strip(" #%"))
     return "csv" if any(re.search(r"\d", line) and re.search(r"\S[,;\t| ]\s*\S", line) for line in lines) else None
 
@@ -221,7 +224,7 @@ def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> Ab
         return own[kind](path, options, settings)
     import_extra("pyarrow", "ingest")  # the readers below need it
     module = {"hdf5": "arrays", "mat": "arrays", "npy": "arrays", "xlsx": "workbook"}.get(kind, kind)
-    if kind in ("rosbag1", "rosbag2", "mcap"):
+    if kind in ("rosbag1", "rosbag2", "mcap", "yaml"):
         module, kind = "bags.reading", "bag"
     opener: Opener = getattr(import_extra(f"service.datasets.formats.{module}", "ingest"), f"open_{kind}")
     return opener(path, options, settings)

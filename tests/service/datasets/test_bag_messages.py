@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.datasets.formats.opening import open_table, sniff
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError
 from tests.service.datasets import bag_writers as bags
@@ -275,3 +276,47 @@ def test_mcap_of_protobuf_is_read(tmp_path):
     check(result)
     assert result.joint_names == tuple(f"j{j}" for j in range(7))
     assert "times are header stamps" in result.facts
+
+
+def echo(numbers, ros1=False, stamped=True):
+    """Return what `ros2 topic echo` prints, or `rostopic echo`."""
+    import yaml
+
+    documents = []
+    for k, (q, dq, tau) in enumerate(numbers):
+        stamp = dict(
+            zip(("secs", "nsecs") if ros1 else ("sec", "nanosec"), divmod(START + k * STEP, 10**9), strict=True)
+        )
+        header = {"header": {"stamp": stamp, "frame_id": ""}} if stamped else {}
+        names = [f"j{j}" for j in range(7)]
+        body = header | {"name": names, "position": q.tolist(), "velocity": dq.tolist(), "effort": tau.tolist()}
+        documents.append(yaml.dump(body, sort_keys=False, default_flow_style=ros1 and None))
+    return "---\n".join([*documents, ""])
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_text_of_topic_echo_is_read(tmp_path, ros1):
+    (tmp_path / "states.txt").write_text(echo(NUMBERS, ros1))
+    assert sniff(tmp_path / "states.txt") == "yaml"
+    result = read(tmp_path / "states.txt")
+    check(result)
+    assert result.joint_names == tuple(f"j{j}" for j in range(7))
+    (tmp_path / "cut.txt").write_text(echo(NUMBERS, ros1)[:-200])
+    cut = read(tmp_path / "cut.txt")
+    assert len(cut.rows) == 39
+    assert any("last record is cut off" in fact for fact in cut.facts)
+
+
+def test_echoed_messages_without_stamps_need_a_time_step(tmp_path):
+    (tmp_path / "states.yaml").write_text(echo(NUMBERS, stamped=False))
+    result = read(tmp_path / "states.yaml")
+    assert result.names[0] == "j0/position"
+    with open_table(tmp_path / "states.yaml", "yaml", ReadOptions(dt=0.01), bags.SETTINGS) as table:
+        assert table.names[0] == "t"
+
+
+def test_yaml_with_aliases_is_refused(tmp_path):
+    bomb = "a: &a [1, 2]\nb: &b [*a, *a]\nposition: [*b, *b]\n---\n"
+    (tmp_path / "bomb.yaml").write_text(bomb)
+    with pytest.raises(InvalidDataError, match="anchors and aliases are not read"):
+        read(tmp_path / "bomb.yaml")

@@ -1,10 +1,11 @@
-"""The messages of a bag: ROS 1 bags and sqlite3 files by `rosbags`, MCAP files by `mcap`.
+"""The messages of a bag: ROS 1 bags and sqlite3 files by `rosbags`, MCAP files by `mcap`; and of `ros2 topic echo`.
 
 No index is used, so recordings that were cut off are read up to their end.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
@@ -35,7 +36,7 @@ class Topic(NamedTuple):
     type: str
     """`package/Name`, as ROS 1 writes it."""
     encoding: str
-    """Encoding of the messages: `cdr`, `ros1`, `json` or `protobuf` can be read."""
+    """Encoding of the messages: `cdr`, `ros1`, `json`, `protobuf` or `yaml` can be read."""
     language: str
     """Language of the definition: `ros1msg`, `ros2msg`, `ros2idl`, `protobuf`, …; "" if the bag has no definition."""
     definition: bytes
@@ -51,15 +52,14 @@ def read_messages(path: Path, facts: list[str]) -> Messages:
     with path.open("rb") as file:
         start = file.read(16)
         file.seek(0)
-        for magic, read in _READERS.items():
-            if start.startswith(magic):
-                messages = read(file)
-                break
-        else:
+        read = next((each for magic, each in _READERS.items() if start.startswith(magic)), None)
+        if read is None and re.match(rb"\s*[A-Za-z_]\w*:", start):
+            read = _read_yaml
+        if read is None:
             value, expected = f"not a bag (it begins with {start!r})", "a ROS 1 bag, a ROS 2 bag or an MCAP file"
             raise invalid_data("file", value if start else "empty", expected)
         try:
-            yield from messages
+            yield from read(file)
         except (ServiceError, MemoryError):
             raise
         except Exception as error:  # the readers raise many kinds for damaged files
@@ -139,6 +139,19 @@ def _read_mcap(file: BinaryIO) -> Messages:
             schema = schemas.get(record.schema_id) or records.Schema(id=0, name="", encoding="", data=b"")
             name = type_name(schema.name)
             topics[record.id] = Topic(record.topic, name, record.message_encoding, schema.encoding, schema.data)
+
+
+def _read_yaml(file: BinaryIO) -> Messages:
+    """Yield the documents that `ros2 topic echo` prints. They have no times of reception: 0."""
+    topic, lines = Topic("echo", "YAML", "yaml", "", b""), list[bytes]()
+    for line in file:
+        if line.strip() != b"---":
+            lines.append(line)
+        elif lines:
+            yield topic, 0, b"".join(lines)
+            lines = []
+    if b"".join(lines).strip():
+        raise EndOfFile
 
 
 _READERS: dict[bytes, Callable[[BinaryIO], Messages]] = {

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import yaml
 from mcap import records
 from mcap_protobuf.decoder import DecoderFactory
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -16,7 +18,7 @@ from service.datasets.formats.bags.containers import Topic
 from service.datasets.formats.table import first_line, unreadable
 from service.foundation.errors import invalid_data
 
-ENCODINGS = ("cdr", "ros1", "json", "protobuf")
+ENCODINGS = ("cdr", "ros1", "json", "protobuf", "yaml")
 MAX_DEFINITION_BYTES = 256 * 1024
 MAX_SEQUENCE = 1_000_000
 """Max length of a list in a message; without it, a list of messages without fields could have any length."""
@@ -32,6 +34,7 @@ _HUMBLE = {
     "geometry_msgs/Vector3 is_cartesian_angular_collision\ngeometry_msgs/Vector3 is_cartesian_linear_contact\n"
     "geometry_msgs/Vector3 is_cartesian_angular_contact\nfloat64[7] is_joint_collision\nfloat64[7] is_joint_contact",
 }
+_ALIAS = re.compile(rb"(?m)(?:^|[:,\[{-])\s*[&*]\w")
 Decoder = Callable[[bytes], Any]
 
 
@@ -46,6 +49,8 @@ def make_decoder(topic: Topic) -> Decoder:
     try:
         if topic.encoding == "json":
             return lambda data: json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
+        if topic.encoding == "yaml":
+            return _decode_yaml
         if topic.encoding == "protobuf":
             schema = records.Schema(id=1, name=topic.type, encoding=topic.language, data=topic.definition)
             if (decoder := DecoderFactory().decoder_for(topic.encoding, schema)) is not None:
@@ -57,6 +62,19 @@ def make_decoder(topic: Topic) -> Decoder:
         raise invalid_data(f"topic {topic.name}", value, expected) from None
     except Exception as error:  # from parsing definitions, which come with the upload
         raise unreadable(f"definition of {topic.type}", first_line(error), "a message definition") from None
+
+
+def _decode_yaml(data: bytes) -> Any:
+    if _ALIAS.search(data):
+        raise ValueError("anchors and aliases are not read")
+    return _named(yaml.load(data, getattr(yaml, "CSafeLoader", yaml.SafeLoader)))  # noqa: S506 - both are safe
+
+
+def _named(value: Any) -> Any:
+    """Return dictionaries as objects with attributes."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{str(name): _named(each) for name, each in value.items()})
+    return [_named(each) for each in value] if isinstance(value, list) else value
 
 
 def _ros_decoder(topic: Topic) -> Decoder:

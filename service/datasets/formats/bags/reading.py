@@ -75,8 +75,10 @@ def _table(sources: Sequence[Source], samples: Sequence[Samples], facts: list[st
     times, values = _merge(samples)
     start = int(times[0])
     facts += [fact for each in samples for fact in each.facts]
-    facts.append(f"times count from {start // NS}.{start % NS:09d} s")
-    names, columns, units = ["t"], [(times - start) / NS], {"t": "s"}
+    names, columns, units = list[str](), list[Array](), {"t": "s"}
+    if times.any():
+        names, columns = ["t"], [(times - start) / NS]
+        facts.append(f"times count from {start // NS}.{start % NS:09d} s")
     for quantity in [each for each in QUANTITIES if each in of]:
         read = sources[of[quantity]].fields
         for j, joint in enumerate(joints):

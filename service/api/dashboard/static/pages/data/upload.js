@@ -8,7 +8,7 @@ import { button, card, field, link, notice, progress } from "../../ui.js";
 import { describeOptions, uploadOptions, withOption } from "./options.js";
 import { uploadError } from "./upload_error.js";
 
-const EXTENSIONS = ".csv,.tsv,.txt,.npz,.parquet,.pq,.ndjson,.jsonl,.json,.db3,.bag,.mcap,.zip,.feather,.arrow,.h5,.hdf5,.mat,.npy,.xlsx,.gz,.zst";
+const EXTENSIONS = ".csv,.tsv,.txt,.npz,.parquet,.pq,.ndjson,.jsonl,.json,.db3,.bag,.mcap,.zip,.feather,.arrow,.h5,.hdf5,.mat,.npy,.xlsx,.yaml,.yml,.gz,.zst";
 
 /** Create the upload card. onUploaded(dataset) is called after each upload. Returns {element, fillRobots(robots)}. */
 export function uploader({ onUploaded, signal }) {
