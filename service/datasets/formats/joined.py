@@ -1,6 +1,8 @@
-"""Reading a zip of text tables, such as positions.txt, velocities.txt and torques.txt, joined side by side.
+"""Reading a zip of text tables that are one recording: joined side by side, or one after the other.
 
-Each has one row per sample. The columns of a file without column names get names from the file name.
+Tables such as positions.txt and torques.txt have one row per sample each. The columns of a file without column names
+get names from the file name. Tables with the same columns are parts in time, or one joint each: then the file's name is
+the joint's.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 
@@ -17,8 +20,15 @@ import numpy as np
 from lipcore.data.samples import Array
 from service.contract.media_types import SUFFIXES
 from service.datasets.formats.table import Table, block_rows, clean_names, first_line, unreadable
-from service.datasets.formats.zips import COPY_BYTES, ERRORS, add_member, check_unpacked_size, open_zip
-from service.datasets.mapping.recognition import find_times
+from service.datasets.formats.zips import (
+    COPY_BYTES,
+    ERRORS,
+    add_member,
+    check_unpacked_size,
+    numbers_in_name,
+    open_zip,
+)
+from service.datasets.mapping.recognition import find_times, interpret_name, is_episode
 from service.datasets.mapping.vocabulary import COMMANDED, MEASURED, find_quantity, split_words
 from service.datasets.options import ReadOptions
 from service.foundation.errors import ServiceError, invalid_data
@@ -58,24 +68,88 @@ def open_joined(path: Path, options: ReadOptions, settings: Settings) -> Iterato
             files = _unpacked(archive, Path(folder), settings)
         left = None if options.column_names is None else list(options.column_names)
         parts: list[Part] = []
-        facts = [f"{len(files)} files were joined side by side: {', '.join(files)}"]
         known: set[str] = set()
+        tables: dict[str, Table] = {}
         for name, file in files.items():
             try:
-                table = stack.enter_context(open_csv(file, options, settings, ColumnNamer(name, left)))
+                tables[name] = stack.enter_context(open_csv(file, options, settings, ColumnNamer(name, left)))
             except ServiceError as error:
                 raise add_member(name, error) from None
-            repeated = known & {table.names[index] for clock in find_times(table.names) for index, _ in clock.parts}
-            parts.append(Part(name, table, [i for i, each in enumerate(table.names) if each not in repeated]))
-            known |= set(table.names)
         if left:
             value, expected = f"{len(left)} names too many", "one name per column of the files without column names"
             raise invalid_data("column_names", value, expected, f"`column_names` has {value}, expected {expected}.")
+        if len({frozenset(table.names) for table in tables.values()}) == 1:
+            starts = {name: _first_time(table) for name, table in tables.items()}
+            if not _are_joints(next(iter(tables.values())), list(starts.values())):
+                yield _one_after_the_other(tables, starts)
+                return
+            for name, table in tables.items():
+                _name_joint(table, PurePosixPath(name).stem)
+        facts = [f"{len(files)} files were joined side by side: {', '.join(files)}"]
+        for name, table in tables.items():
+            repeated = known & {table.names[index] for clock in find_times(table.names) for index, _ in clock.parts}
+            parts.append(Part(name, table, [i for i, each in enumerate(table.names) if each not in repeated]))
+            known |= set(table.names)
         names = clean_names([part.table.names[i] for part in parts for i in part.kept])
         units = {name: unit for part in parts for name, unit in part.table.units.items()}
         joined = Table(names, iter(()), units=units, facts=facts)
         joined.blocks = _side_by_side(parts, len(names), joined)
         yield joined
+
+
+def _first_time(table: Table) -> float | None:
+    """Return the time of a table's first row, in the unit of its column; None without times."""
+    clock = next(iter(find_times(table.names)), None)
+    first = next(table.blocks, None)
+    if first is None:
+        return None
+    table.blocks = chain([first], table.blocks)
+    return None if clock is None else float(first[0, clock.parts[0][0]])
+
+
+def _are_joints(table: Table, starts: Sequence[float | None]) -> bool:
+    """Return whether tables with these columns are a joint each: no column names one, and all begin together."""
+    readings = [reading for name in table.names for reading in interpret_name(name)[:1]]
+    return bool(readings) and not any(reading.joint for reading in readings) and len(set(starts)) == 1
+
+
+def _name_joint(table: Table, joint: str) -> None:
+    times = {index for clock in find_times(table.names) for index, _ in clock.parts}
+    new = [name if index in times else f"{joint}/{name}" for index, name in enumerate(table.names)]
+    table.units = {new[table.names.index(name)]: unit for name, unit in table.units.items()}
+    table.names = tuple(new)
+
+
+def _one_after_the_other(tables: dict[str, Table], starts: dict[str, float | None]) -> Table:
+    """Return tables with the same columns as one, in the order of their times, else of their names.
+
+    If their times do not go on from one to the next, each is an episode.
+    """
+    order = list(tables)
+    if None not in starts.values() and len(set(starts.values())) == len(order):
+        order.sort(key=lambda name: (starts[name] or 0.0, name))
+        episodes = False
+    else:
+        order.sort(key=numbers_in_name)
+        episodes = not any(map(is_episode, tables[order[0]].names))
+    names = tables[order[0]].names
+    facts = [f"{len(order)} files were joined one after the other: {', '.join(order)}"]
+
+    def blocks() -> Iterator[Array]:
+        for number, name in enumerate(order):
+            table = tables[name]
+            places = [table.names.index(each) for each in names]
+            try:
+                for block in table.blocks:
+                    chosen = block[:, places]
+                    yield np.column_stack([np.full(len(block), float(number)), chosen]) if episodes else chosen
+            except ServiceError as error:
+                raise add_member(name, error) from None
+            joined.facts += [f"{name}: {fact}" for fact in table.facts]
+
+    joined = Table(("episode", *names) if episodes else names, iter(()), units=tables[order[0]].units, facts=facts)
+    joined.blocks = blocks()
+    return joined
 
 
 class ColumnNamer:

@@ -119,3 +119,32 @@ def test_dot_q_is_a_velocity_and_currents_are_not_torques(tmp_path):
         *(f"{name}{joint}" for name in ("q", "dq") for joint in (1, 2, 3)),
         *(f"dataCur_{j}" for j in (1, 2, 3)),
     )
+
+
+def test_files_of_one_joint_each_are_joined_by_their_names(tmp_path):
+    parts = {
+        f"joint{j + 1}__csv": text(np.column_stack([T, Q[:, j], TAU[:, j]]), "time,position,torque [Nmm]", ",")
+        for j in (1, 0)
+    }
+    result = read(tmp_path, zipped(**parts), "zip")
+    assert result.names[0] == "time"
+    assert set(result.names[1:]) == {f"joint{j}/{name}" for j in (1, 2) for name in ("position", "torque [Nmm]")}
+    np.testing.assert_array_equal(result["joint2/position"], Q[:, 1])
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["times go on", "times begin again"])
+def test_parts_in_time_are_joined_one_after_the_other(tmp_path, again):
+    """Ten parts, whose names sort as text in another order."""
+    whole = np.column_stack([T, Q, TAU])
+    parts = {}
+    for number in range(10):
+        rows = whole[4 * number : 4 * number + 4].copy()
+        rows[:, 0] -= rows[0, 0] * again
+        parts[f"part{number + 1}__csv"] = text(rows, "t,q1,q2,q3,tau1,tau2,tau3", ",")
+    result = read(tmp_path, zipped(**dict(sorted(parts.items()))), "zip")
+    np.testing.assert_array_equal(result.rows[:, -6:], whole[:, 1:])
+    if again:
+        np.testing.assert_array_equal(result["episode"], np.repeat(np.arange(10), 4))
+    else:
+        np.testing.assert_array_equal(result["t"], T)
+    assert result.facts[0].startswith("10 files were joined one after the other: part1.csv, part2.csv, part3")
