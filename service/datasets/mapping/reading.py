@@ -20,6 +20,7 @@ from service.datasets.mapping.checks import ColumnStats, Rows, TimeChecker, Turn
 from service.datasets.mapping.choice import MOTION
 from service.datasets.mapping.joints import WARNING
 from service.datasets.mapping.mapping import ColumnMap, Source, map_columns
+from service.datasets.mapping.recognition import Rank, interpret_name
 from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
@@ -76,6 +77,7 @@ def read(
             mapped, t=(), episode=None, quantities={each: mapped.quantities[each] for each in ("q", "tau")}
         )
     reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings, min_samples, without)
+    reader.commands = _commands(mapped, table.names)
     for block in chain([] if first is None else [first], table.blocks):
         reader.add(block)
     reader.finish()
@@ -112,6 +114,18 @@ def _without_effort(mapped: ColumnMap, block: Array) -> dict[str, Source]:
     return found if len(found) < len(mapped.joints) else {}
 
 
+def _commands(mapped: ColumnMap, names: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Return the pairs of a torque that is read and one that was commanded, by the name of the second."""
+    return {
+        name: (source.index, names.index(name))
+        for name in mapped.unused
+        for reading in interpret_name(name)[:1]
+        if reading.quantity == "tau" and reading.rank == Rank.COMMANDED
+        for label, source in zip(mapped.joints, mapped.quantities["tau"], strict=True)
+        if reading.joint in {label, *(each.joint for each in interpret_name(source.name)[:1])}
+    }
+
+
 class _Reader:
     """Stages the blocks of a table and collects the statistics for the final checks."""
 
@@ -133,6 +147,8 @@ class _Reader:
         self.stats = {quantity: [ColumnStats(each.name) for each in row] for quantity, row in mapped.quantities.items()}
         self.turns = [TurnUnwrapper() for _ in mapped.joints]
         self.left_out = {name: ColumnStats(each.name) for name, each in mapped.dropped.items()}
+        self.commands: dict[str, tuple[int, int]] = {}
+        """Torques that were commanded and equal those that are read, as far as known: see `_commands`."""
         self.absent = {quantity for quantity in MOTION if quantity in mapped.quantities}
         """Quantities without a value so far."""
 
@@ -143,6 +159,9 @@ class _Reader:
         if self.rows > self.settings.max_samples:
             expected = f"at most {self.settings.max_samples}"
             raise invalid_data("rows", self.rows, expected, f"The file has too many rows, expected {expected}.")
+        for name, (read, commanded) in list(self.commands.items()):
+            if not np.array_equal(block[:, read], block[:, commanded], equal_nan=True):
+                del self.commands[name]
         for joint, source in self.without.items():
             if (given := np.isfinite(block[:, source.index])).any():
                 where, value = f"{source.name}, row {rows[given.argmax()]}", block[given.argmax(), source.index]
@@ -176,6 +195,11 @@ class _Reader:
     def notes(self) -> list[str]:
         """Return sentences on values that were changed or not used."""
         out = [f"{quantity} has no values and is ignored" for quantity in MOTION if quantity in self.absent]
+        if self.commands:
+            out.append(
+                f"{WARNING}The torque equals what was commanded, {', '.join(self.commands)}, in all rows: it was not "
+                "measured. If the robot has torque or current columns, read them with `columns`."
+            )
         if self.without:
             out.append(f"joints without effort are left out: {', '.join(self.without)}")
         for name, turns in zip(self.mapped.joints, self.turns, strict=True):

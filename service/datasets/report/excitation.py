@@ -103,7 +103,8 @@ def judge_friction(
     if min(forwards, backwards) < FRICTION.seldom:
         still = max(forwards, backwards) < FRICTION.seldom
         for kind in ("viscous", "coulomb", "offset") if still else ("coulomb", "offset"):
-            out[kind] = out[kind].model_copy(update={"verdict": "not determined", "implausible": False})
+            unknown = {"value": None, "std": None, "share": None} if still else {}
+            out[kind] = out[kind].model_copy(update={"verdict": "not determined", "implausible": False} | unknown)
     return out
 
 

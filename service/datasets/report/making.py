@@ -89,6 +89,8 @@ def make_report(
     proposal = suggest_robot(upload, candidates, best)
     suggested = [] if proposal is None else [proposal]
     unknown = ask_for_robot(len(names)) if profile is None and proposal is None else None
+    if gravity and against is not None and not _is_gravity_determined(against):
+        reading.append(texts.undetermined_gravity(against.robot))
     robot_advice = [each.text for each in suggested] + ([] if unknown is None else [unknown])
     report = schema.DatasetReport(
         rows_uploaded=raw.rows,
@@ -123,6 +125,10 @@ def make_report(
         advice=robot_advice + collect_advice(times.timing, excitation, recorded.limits, recorded.noise),
     )
     return report.model_dump(mode="json")
+
+
+MAX_GRAVITY_STD = 0.3
+"""Standard deviation of gravity's factor, 1 with and 0 without gravity, below which both can be told apart."""
 
 
 @dataclass(frozen=True)
@@ -304,6 +310,11 @@ def _compare_with_robot(
     comparison = None if bodies is None else compare(bodies, signals)
     faults = find_faults(upload, bodies, comparison, signals, excitation.joints, samples.work)
     return None if bodies is None or comparison is None else _show(bodies, comparison), faults
+
+
+def _is_gravity_determined(against: schema.AgainstRobot) -> bool:
+    """Return whether the torque of some joint shows whether it contains gravity."""
+    return any(each.gravity is not None and (each.gravity_std or 0.0) < MAX_GRAVITY_STD for each in against.joints)
 
 
 def _show(bodies: Bodies, comparison: Comparison) -> schema.AgainstRobot:

@@ -286,6 +286,14 @@ def weak_excitation(weak: int, parameters: int, weakest_body: str) -> str:
     )
 
 
+def undetermined_gravity(robot: str) -> str:
+    """Note that a recording does not show whether its torque contains gravity."""
+    return (
+        f"undetermined: whether the torque contains gravity, because the gravity of {robot} hardly changes in this "
+        "recording"
+    )
+
+
 def held_poses(share: float) -> str:
     """Report a recording of held poses."""
     return (

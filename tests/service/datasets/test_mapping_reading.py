@@ -345,3 +345,13 @@ def test_one_joint_of_a_robot_is_read(reading):
     result = reading(data)
     assert result.staged.joint_names == ("joint3",)
     np.testing.assert_array_equal(result.staged.read("tau1"), data["tau3"])
+
+
+def test_torque_that_equals_a_command_is_named(reading):
+    data = canonical(motion(n=2))
+    wanted = {f"commanded_tau{j}": data[f"tau{j}"].copy() for j in (1, 2)}
+    equal = "The torque equals what was commanded, commanded_tau1, commanded_tau2, in all rows"
+    assert any(equal in each for each in reading(data | wanted).noted)
+    wanted["commanded_tau1"][-1] += 1e-3
+    wanted["commanded_tau2"][7] += 1e-3
+    assert not any("equals what was commanded" in each for each in reading(data | wanted).noted)

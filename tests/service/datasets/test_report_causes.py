@@ -263,3 +263,21 @@ def test_missing_gravity_shows_in_narrow_motion(tmp_path: Path) -> None:
     for measured, causes in ((tau, []), (tau - gravity("ur5", q), ["no_gravity"])):
         columns = {"t": t, "q": q, "dq": dq, "tau": measured}
         assert [each.cause for each in report_on(tmp_path, arm.joint_names, columns, arm).remedies] == causes
+
+
+def test_gravity_that_the_motion_does_not_show_is_reported_as_undetermined(tmp_path: Path) -> None:
+    """Of an upright arm only the first and the last joint move, which changes no gravity."""
+    t, rng = np.arange(2000) / 50, np.random.default_rng(2)
+    q = np.tile([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0], (2000, 1))
+    q[:, 0], q[:, 5] = np.sin(t) + 0.3 * np.sin(7**0.5 * t), 0.7 * np.sin(3**0.5 * t)
+    dq = np.gradient(q, t, axis=0)
+    tau = inverse_dynamics(load_robot("ur5"), q, dq, np.gradient(dq, t, axis=0)) + 2 * dq
+    columns = {"t": t, "q": q, "dq": dq, "tau": tau + 0.05 * rng.standard_normal(q.shape)}
+    noted = "undetermined: whether the torque contains gravity"
+    names, arm = profiles.profile("ur5").joint_names, profiles.profile("ur5")
+    assert any(each.startswith(noted) for each in report_on(tmp_path, names, columns, arm).reading)
+    q[:, 1] += 0.6 * np.sin(0.9 * t)
+    dq = np.gradient(q, t, axis=0)
+    tau = inverse_dynamics(load_robot("ur5"), q, dq, np.gradient(dq, t, axis=0)) + 2 * dq
+    columns |= {"q": q, "dq": dq, "tau": tau + 0.05 * rng.standard_normal(q.shape)}
+    assert not any(each.startswith(noted) for each in report_on(tmp_path, names, columns, arm).reading)
