@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,7 +38,9 @@ def unpack_description(archive: Path, folder: Path, max_bytes: int) -> Path:
                 raise UrdfError(f"the zip has more than {MAX_FILES} files or {max_bytes} bytes")
             texts = [each for each in members if each.filename.endswith((*ENDINGS, ".yaml", ".yml"))]
             opened.extractall(folder, texts)  # drops `..` and absolute paths
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
+    except UrdfError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError, EOFError, ValueError) as error:
         raise UrdfError(f"the zip cannot be read: {error}") from None
     found = {path: _read(path) for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix in ENDINGS}
     included = {os.path.basename(name) for text in found.values() for name in _INCLUDE.findall(text)}

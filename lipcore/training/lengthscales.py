@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
@@ -161,6 +160,8 @@ class _Search:
 
             start = min(starts, key=lambda each: objective(each)[0])
             options = {"maxiter": iterations, "maxcor": 30, "ftol": 1e-6}
+            from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
+
             found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
             return float(found.fun), np.asarray(found.x)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -41,13 +39,13 @@ def read_robot(upload: Path, scale: dict[str, float], xacro: dict[str, str], fol
     Raise InvalidDataError naming the error in it.
     """
     try:
-        file, files = upload, folder / "files"
+        content, files = upload.read_bytes(), folder / "files"
         files.mkdir()
-        if zipfile.is_zipfile(upload):
+        if content.startswith(b"PK\x03\x04"):
             file = unpack_description(upload, files, max_bytes)
         else:
             file = files / "robot.xacro"
-            shutil.copyfile(upload, file)
+            file.write_bytes(content)
         urdf = _decode(file.read_bytes())
         if is_mjcf(urdf):
             urdf = convert_mjcf(urdf, folder)

@@ -1,63 +1,60 @@
 """Calls of functions that read untrusted files, each in a confined process: see `confinement`.
 
-A process that has imported the readers waits for calls and forks a process ahead of each: see `reader_process`. It
-receives names, paths and plain values; it returns data of a type that the caller names, and they are checked. Nothing
-is unpickled. A process that crashes, hangs or exceeds a limit fails only its own call, with 422 or 413.
+A fork server of the standard library, which has imported the readers, forks a process for each call. The result comes
+back as data of a type that the caller names; it is checked, and never unpickled.
 """
 
 from __future__ import annotations
 
-import json
 import logging
+import multiprocessing
 import os
 import signal
-import socket
-import subprocess
-import sys
 import threading
+import time
+import traceback
 from contextlib import suppress
+from functools import cache
+from importlib import import_module
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
 from lipcore.extras import MissingExtraError
-from service.foundation.errors import NotReadyError, ServiceError, TooLargeError, invalid_data, problem, readable
+from service.foundation import errors
+from service.foundation.errors import ServiceError, invalid_data, problem, readable
 from service.foundation.settings import Settings
-from service.runtime.confinement import MAX_OPEN_FILES
-from service.runtime.progress import CHECK_S, Progress
-from service.runtime.reader_messages import (
-    ERRORS,
-    MAX_OUTPUT_BYTES,
-    Answer,
-    Call,
-    Failure,
-    Outcome,
-    from_plain,
-    receive,
-    send,
-    to_plain,
-)
+from service.runtime.confinement import ENVIRONMENT, MAX_OPEN_FILES, confine
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
-
-IMPORT_S = 120.0
-"""Max wait for a process to start, import a reader or answer, s, on a busy machine."""
-ENVIRONMENT = {
-    "LANG": "C.UTF-8",
-    "OPENBLAS_NUM_THREADS": "1",  # a running thread is not copied by a fork
-    "OMP_NUM_THREADS": "1",
-    "MALLOC_ARENA_MAX": "2",  # each uses address space, even if empty
-    "ARROW_DEFAULT_MEMORY_POOL": "system",
-}
 CPU_SHARE = 0.5
 """Max processor time of one upload's reader, as a share of its max time."""
-_making = threading.Lock()
+MAX_ANSWER_BYTES = 32 * 1024 * 1024
+"""Max size of an answer: names and facts, as numbers are sent in files."""
+_KINDS = errors.InvalidDataError, errors.InvalidRequestError, errors.StorageFullError, errors.TooLargeError
+ERRORS = {each.code: each for each in _KINDS}
+"""Errors that a function may raise, by code; MissingExtraError and OSError are allowed too."""
+_starting = threading.Lock()
 
 
 class UnexpectedReaderError(RuntimeError):
     """A reader failed with an unexpected error; the log shows it."""
+
+
+class Answer(msgspec.Struct):
+    """The value of a function, or its error: a code of ERRORS, `limit`, `extra`, `system` or `unexpected`."""
+
+    value: msgspec.Raw = msgspec.Raw(b"\xc0")
+    error: str | None = None
+    message: str = ""
+    detail: list[tuple[str, str | None, str]] = []
+    number: int = 0
+
+
+_ANSWERS = msgspec.msgpack.Decoder(Answer)
 
 
 def run(
@@ -70,91 +67,133 @@ def run(
 ) -> T:
     """Call `module:function` in a confined process; return its result as the type `returns`.
 
-    Blocking: use it in a thread.
-
-    - function: its module is imported before the fork; the module's function `warm`, if any, is called then.
-    - returns: the type that the result is checked against.
-    - arguments: plain values, data classes of them, paths, small arrays, and settings. Only the settings that
-      readers need are sent.
-    - settings: contain the limits.
-    - folder: the function may write here. It may read paths among the arguments.
-    - field: name of the file in errors.
+    Blocking: use it in a thread. settings: contain the limits. folder: the function may write here; it may read paths
+    among the arguments. Of settings among the arguments, only limits are sent. field: name of the file in errors.
 
     Raise the function's error if it is one of `ERRORS`, MissingExtraError or OSError. Raise InvalidDataError if it
     crashed or reached a limit, TooLargeError if the limit is one of size, UnexpectedReaderError for any other error.
     """
-    limits = settings.parser_memory_bytes, cpu_s(settings), settings.parser_s, settings.max_unpacked_bytes
-    paths = [os.fspath(each) for each in arguments if isinstance(each, Path)]
-    write = [] if folder is None else [os.fspath(folder)]
-    encoded = msgspec.Raw(msgspec.msgpack.encode(arguments, enc_hook=to_plain))
-    outcome = _ask(Call(function, encoded, paths, write, *limits))
-    if outcome.output:
-        shown = readable(outcome.output.decode(errors="backslashreplace"))[:MAX_OUTPUT_BYTES]
-        logger.warning("output of a reader of an upload", extra={"fields": {"reader": function, "output": shown}})
-    if outcome.late:
+    given = tuple(_limits_of(each) if isinstance(each, Settings) else each for each in arguments)
+    bounds = settings.parser_memory_bytes, cpu_s(settings), settings.max_unpacked_bytes
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    with ours:
+        with theirs, _starting:
+            process = _context().Process(
+                target=_answer, args=(theirs, function, given, bounds, folder, settings.parser_s), daemon=True
+            )
+            try:
+                process.start()
+            except (OSError, EOFError) as error:
+                reason = f"uploads cannot be read at present: no reader process could be started ({error!r})"
+                raise errors.NotReadyError(reason) from None
+        content, until = b"", time.monotonic() + settings.parser_s
+        wait([ours, process.sentinel], settings.parser_s)
+        with suppress(EOFError, OSError):
+            content = ours.recv_bytes(MAX_ANSWER_BYTES) if ours.poll() else b""
+    late = not content and not wait([process.sentinel], max(0.0, until - time.monotonic()))
+    if content or late:
+        process.kill()  # it has answered; a normal exit takes milliseconds
+    process.join()
+    if late:
         raise _beyond("time", field, settings)
-    if outcome.status == -signal.SIGXCPU:
+    if process.exitcode == -signal.SIGXCPU:
         raise _beyond("processor", field, settings)
     try:
-        answer = _decoder(Answer).decode(outcome.answer)
-        if answer.failure is not None:
-            raise _error(answer.failure, function, field, settings)
-        if outcome.status == 0:
+        answer = _ANSWERS.decode(content)
+        if answer.error is None:
             return _decoder(returns).decode(answer.value)
-    except msgspec.MsgspecError as error:
-        logger.warning("a reader of an upload sent an invalid answer: %s", error)
-    message = f"The upload could not be read: its reader {_ending(outcome.status)}."
-    raise invalid_data(field, "unreadable", "an undamaged file", message)
-
-
-def _decoder(kind: type[T]) -> msgspec.msgpack.Decoder[T]:
-    """Return a decoder, made by one thread at a time.
-
-    Two threads that first use a msgspec type at the same time can crash the process.
-    """
-    with _making:
-        return msgspec.msgpack.Decoder(kind, dec_hook=from_plain)
-
-
-def _ask(call: Call) -> Outcome:
-    data = msgspec.msgpack.encode(call)
-    for _ in range(2):
-        try:
-            connection, process = _spawner.connect()
-            with connection:
-                _start_call(call, connection, process)
-                connection.settimeout(call.wall_s + IMPORT_S)
-                send(connection, data)
-                return _decoder(Outcome).decode(receive(connection))
-        # the waiting process had just ended, hangs, or cannot start
-        except (EOFError, OSError) as error:
-            failed = error
-    raise NotReadyError(f"uploads cannot be read at present: no reader process could be started ({failed!r})")
-
-
-def _start_call(call: Call, connection: socket.socket, process: Any) -> None:
-    """Send the name of a call's function and wait until a process accepts the call.
-
-    Raise TimeoutError if the waiting process hangs; it is killed first.
-    """
-    progress = Progress(lambda: [process.pid], call.wall_s, IMPORT_S)
-    connection.settimeout(CHECK_S)
-    send(connection, call.function.encode())
-    while True:
-        try:
-            if connection.recv(1):
-                return
-            raise EOFError
-        except TimeoutError:
-            if (reason := progress.check()) is not None:
-                logger.error("the process that reads uploads hangs and is killed: %s", reason)
-                _spawner.end(process)
-                raise
+    except msgspec.MsgspecError:
+        code = process.exitcode or 0
+        ending = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        message = f"The upload could not be read: its reader {ending}."
+        raise invalid_data(field, "unreadable", "an undamaged file", message) from None
+    raise _error(answer, function, field, settings)
 
 
 def cpu_s(settings: Settings) -> int:
     """Return the max processor time for reading one upload, s."""
     return max(1, round(CPU_SHARE * settings.parser_s))
+
+
+def _decoder(kind: type[T]) -> msgspec.msgpack.Decoder[T]:
+    """Return a decoder, made by one thread at a time: two that first use a type of msgspec can crash the process."""
+    with _starting:
+        return msgspec.msgpack.Decoder(kind)
+
+
+@cache
+def _context() -> Any:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["service.runtime.preload"])
+    return context
+
+
+def _limits_of(settings: Settings) -> Settings:
+    """Return settings without secrets."""
+    names = [name for name in Settings.model_fields if name.startswith(("max_", "min_"))]
+    return Settings.model_construct(**{name: getattr(settings, name) for name in names})
+
+
+def _answer(
+    connection: Connection,
+    function: str,
+    given: tuple[Any, ...],
+    bounds: tuple[int, int, int],
+    folder: Path | None,
+    wall_s: float,
+) -> None:
+    """Confine this process, call the function, and send the answer."""
+    os.setsid()
+    signal.alarm(int(wall_s) + 2)  # ends it if the service was killed
+    os.nice(5)  # control loops have priority over uploads
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for descriptor in range(3):
+        os.dup2(nothing, descriptor)
+    os.closerange(3, connection.fileno())
+    os.closerange(connection.fileno() + 1, 1 << 16)
+    os.environ.clear()
+    os.environ.update(ENVIRONMENT | dict.fromkeys(("TMPDIR", "SQLITE_TMPDIR"), str(folder or "/nonexistent")))
+    module, _, name = function.partition(":")
+    try:
+        called = getattr(import_module(module), name)
+        confine(*bounds, [each for each in given if isinstance(each, Path)], [] if folder is None else [folder])
+        value = msgspec.msgpack.encode(called(*given))
+        answer = Answer(msgspec.Raw(value))
+    except Exception as error:
+        answer = _failure(error)
+    connection.send_bytes(msgspec.msgpack.encode(answer))
+
+
+def _failure(error: Exception) -> Answer:
+    """Return the error to send. A reached limit may be the cause of an error, whatever the reader made of it."""
+    each: BaseException | None = error
+    while each is not None:
+        limit = {27: "size", 24: "files"}.get((isinstance(each, OSError) and each.errno) or 0)  # EFBIG, EMFILE
+        if limit or isinstance(each, MemoryError):
+            return Answer(error="limit", message=limit or "memory")
+        each = each.__context__
+    if isinstance(error, ServiceError) and error.code in ERRORS:
+        detail = [(item.field, item.value, item.expected) for item in error.detail]
+        return Answer(error=error.code, message=error.message, detail=detail)
+    if isinstance(error, MissingExtraError):
+        return Answer(error="extra", detail=[(error.extra, error.lacking, error.reason or "")])
+    if isinstance(error, OSError) and error.errno:
+        return Answer(error="system", number=error.errno)
+    return Answer(error="unexpected", message="".join(traceback.format_exception(error))[-4000:])
+
+
+def _error(answer: Answer, function: str, field: str, settings: Settings) -> Exception:
+    if answer.error == "limit":
+        return _beyond(answer.message, field, settings)
+    if answer.error == "extra":
+        extra, lacking, reason = answer.detail[0]
+        return MissingExtraError(extra, str(lacking), reason or None)
+    if answer.error == "system":
+        return OSError(answer.number, os.strerror(answer.number))
+    if answer.error in ERRORS:
+        items = [problem(where, value, expected) for where, value, expected in answer.detail]
+        return ERRORS[answer.error](readable(answer.message), items)
+    return UnexpectedReaderError(f"{function}: {readable(answer.message)}")
 
 
 def _beyond(limit: str, field: str, settings: Settings) -> ServiceError:
@@ -170,84 +209,4 @@ def _beyond(limit: str, field: str, settings: Settings) -> ServiceError:
     expected = f"at most {most}" + ("" if setting is None else f" ({setting} sets it)")
     message = f"Reading the upload takes more than {most} of {what}" + (f" ({setting})." if setting else ".")
     error = invalid_data(field, f"an upload that takes more than {most} of {what} to read", expected, message)
-    return TooLargeError(error.message, error.detail) if limit == "size" else error
-
-
-def _error(failure: Failure, function: str, field: str, settings: Settings) -> Exception:
-    if failure.code == "limit":
-        return _beyond(failure.message, field, settings)
-    if failure.code == "extra":
-        extra, lacking, reason = failure.detail[0]
-        return MissingExtraError(extra, str(lacking), reason or None)
-    if failure.code == "system":
-        return OSError(failure.number, os.strerror(failure.number))
-    if failure.code in ERRORS:
-        items = [problem(where, value, expected) for where, value, expected in failure.detail]
-        return ERRORS[failure.code](readable(failure.message), items)
-    return UnexpectedReaderError(f"{function}: {readable(failure.message)}")
-
-
-def _ending(status: int) -> str:
-    if status >= 0:
-        return f"ended with exit code {status}"
-    with suppress(ValueError):
-        return f"was ended by {signal.Signals(-status).name}"
-    return f"was ended by signal {-status}"
-
-
-class _Spawner:
-    """The child process that waits for calls; started on the first call."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._control: socket.socket | None = None
-        self._process: Any = None
-        self._owner = 0
-
-    def connect(self) -> tuple[socket.socket, Any]:
-        """Return a connection for one call and the process that receives it; raise OSError if none can start."""
-        ours, theirs = socket.socketpair()
-        with theirs, self._lock:
-            control = self._control if self._owner == os.getpid() else None  # a forked process starts its own
-            try:
-                if control is None:
-                    raise ConnectionError
-                socket.send_fds(control, [b"c"], [theirs.fileno()])
-            except ConnectionError:  # the process ended because no call arrived for long
-                socket.send_fds(self._start(), [b"c"], [theirs.fileno()])
-            return ours, self._process
-
-    def end(self, process: Any) -> None:
-        """Kill a process; the next call starts another one."""
-        with self._lock:
-            if process is self._process and self._control is not None:
-                process.kill()
-                self._control.close()
-                self._control = None
-
-    def _start(self) -> socket.socket:
-        self._owner = os.getpid()
-        self._control, theirs = socket.socketpair()
-        with theirs:
-            self._process = start(theirs)
-        return self._control
-
-
-def start(control: socket.socket) -> Any:
-    """Start a process that serves the calls of a socket, with only the descriptors and variables that it needs."""
-    path = json.dumps([os.path.abspath(each) for each in sys.path])
-    code = (
-        "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from service.runtime import reader_process as process"
-    )
-    return subprocess.Popen(  # noqa: S603 - our own
-        [sys.executable, "-I", "-c", f"{code}; process.serve({control.fileno()})", path],
-        pass_fds=[control.fileno()],
-        stdin=subprocess.DEVNULL,
-        env=ENVIRONMENT
-        | {name: os.environ[name] for name in ("LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "TZ") if name in os.environ},
-        cwd="/",
-        start_new_session=True,  # Ctrl-C must not reach it
-    )
-
-
-_spawner = _Spawner()
+    return errors.TooLargeError(error.message, error.detail) if limit == "size" else error

@@ -5,7 +5,6 @@ Shared services, and training and learning of all services in this process, star
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,6 +27,7 @@ PRELOADED = [
     "service.training.worker",
     "service.learning.learner.worker",
     "service.learning.weigher.worker",
+    "service.runtime.preload",
     __name__,
 ]
 STARTERS = ("service.runtime.process", "service.runtime.companion")
@@ -90,25 +90,9 @@ def warm_processes() -> Iterator[None]:
     with (
         patch.multiple(STARTERS[0], multiprocessing=_shim()),
         patch.multiple(STARTERS[1], multiprocessing=_shim()),
-        patch("service.runtime.cage.start", _start),
+        patch("service.runtime.cage._context", _context),
     ):
         yield
-
-
-def _start(control: socket.socket) -> ForkServerProcess:
-    """Start the process that reads uploads, one for each service."""
-    # a daemon, so that exit does not wait for it
-    process = _context().Process(target=_serve_calls, args=(control,), daemon=True)
-    process.start()
-    return process
-
-
-def _serve_calls(control: socket.socket) -> None:
-    from service.runtime import cage, reader_process
-
-    os.environ.clear()
-    os.environ.update(cage.ENVIRONMENT)
-    reader_process.serve(control.detach())
 
 
 def _shim() -> SimpleNamespace:
@@ -171,7 +155,7 @@ def _serve(
     forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]
     for module in STARTERS:
         import_module(module).multiprocessing = _shim()  # type: ignore[attr-defined]
-    import_module("service.runtime.cage").start = _start  # type: ignore[attr-defined]
+    import_module("service.runtime.cage")._context = _context  # type: ignore[attr-defined]
     for place, value in constants.items():
         module, _, name = place.rpartition(".")
         vars(import_module(module))[name] = value

@@ -3,7 +3,6 @@
 import ctypes
 import os
 import resource
-import signal
 import socket
 import subprocess
 import threading
@@ -31,10 +30,6 @@ def long_text(size: int) -> str:
 
 def crash() -> None:
     ctypes.string_at(0)
-
-
-def kill_self() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def exit_at_once() -> None:

@@ -131,7 +131,7 @@ def test_shards_without_rows_are_omitted(parts):
 def test_sum_is_the_same_in_processes_and_inline(settings, parts, model):
     """Inline and in processes the bits are equal; the direct computation agrees to rounding."""
     table = Table([masked(parts[0]), parts[0]])
-    context = Context(settings, packed(model), model.joint_names, "cpu")
+    context = Context(settings, packed(model), model.joint_names, None, "cpu")
     work, shards = partial(shard_statistics, context), table.shards()
     here = sum_shards(Inline(), work, shards, lambda: False)
     with shard_executor(settings) as executor:

@@ -1,13 +1,9 @@
 """The cage that reads files: return values, limits, and what the confined process is not allowed to do."""
 
-import logging
 import os
-import signal
-import socket
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -16,11 +12,8 @@ from lipcore.extras import MissingExtraError
 from service.foundation.errors import InvalidDataError, NotReadyError, TooLargeError
 from service.foundation.settings import Settings
 from service.runtime import cage
-from service.runtime.cage import start
-from service.runtime.confinement import FORBIDDEN_CALLS, SELF_ONLY_CALLS, build_filter, protections
-from service.runtime.reader_messages import MAX_ANSWER_BYTES, MAX_OUTPUT_BYTES, Failure
-from tests.service.data import eventually
-from tests.service.server import children
+from service.runtime.cage import MAX_ANSWER_BYTES
+from service.runtime.confinement import FORBIDDEN, build_filter, protections
 
 MiB = 1024 * 1024
 HERE = "tests.service.runtime.inmates"
@@ -29,14 +22,9 @@ landlocked = pytest.mark.skipif(not protections()["landlock"], reason="a kernel 
 filtered = pytest.mark.skipif(not protections()["seccomp"], reason="a system without seccomp, or an unknown processor")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _start_processes_as_the_service_does():
-    """Start processes as a service does, not as its tests."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(cage, "start", start)
-        patched.setattr(cage, "CPU_SHARE", 1 / 30)
-        patched.setattr(cage, "_spawner", cage._Spawner())
-        yield
+@pytest.fixture(autouse=True)
+def _little_processor_time(monkeypatch):
+    monkeypatch.setattr(cage, "CPU_SHARE", 1 / 30)
 
 
 @pytest.fixture
@@ -66,7 +54,7 @@ def test_value_is_returned_and_its_type_checked(settings, tmp_path):
 
 def test_answer_above_the_size_limit_is_rejected(settings):
     assert len(call("long_text", str, MAX_ANSWER_BYTES - 100, settings=settings)) == MAX_ANSWER_BYTES - 100
-    assert "exit code 0" in failure_message("long_text", MAX_ANSWER_BYTES, settings=settings)
+    assert "could not be read" in failure_message("long_text", MAX_ANSWER_BYTES, settings=settings)
 
 
 def test_errors_of_readers_are_passed_on_unchanged(settings):
@@ -77,28 +65,17 @@ def test_errors_of_readers_are_passed_on_unchanged(settings):
     assert failure_message("raise_reader_error", "size", settings=settings, error=TooLargeError) == "too large"
 
 
-def test_bug_in_a_reader_is_logged_with_its_output(settings, caplog):
-    with pytest.raises(cage.UnexpectedReaderError, match="KeyError: 'a bug'"):
+def test_bug_in_a_reader_is_reported_with_its_traceback(settings, capfd):
+    with pytest.raises(cage.UnexpectedReaderError, match="in raise_key_error") as caught:
         call("raise_key_error", object, settings=settings)
-    (record,) = [each for each in caplog.records if each.name == "service.runtime.cage"]
-    parts = ("noise\\n\\x1b[31m of a library", "in raise_key_error")
-    assert [part for part in parts if part not in record.fields["output"]] == []
-
-
-def test_logged_output_is_short_and_printable(settings, caplog, capfd):
-    assert call("write_output", int, 100_000, settings=settings) == 7
-    (record,) = caplog.records
-    assert (record.levelno, record.fields["reader"]) == (logging.WARNING, f"{HERE}:write_output")
-    assert record.fields["output"].startswith("out\\n\\x1b[2Jxxx")
-    assert len(record.fields["output"]) <= MAX_OUTPUT_BYTES
-    assert capfd.readouterr() == ("", "")
+    assert "KeyError: 'a bug'" in str(caught.value)
+    assert "noise" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("name", "limits", "parts"),
     [
         ("crash", {}, ("The upload could not be read", "SIGSEGV")),
-        ("kill_self", {}, ("The upload could not be read", "SIGKILL")),
         ("exit_at_once", {}, ("The upload could not be read", "exit code 3")),
         ("sleep", {"parser_s": 0.2}, ("more than 0.2 s of time", "LIPSERVE_PARSER_S")),
         ("close_all_and_sleep", {"parser_s": 0.2}, ("more than 0.2 s of time", "LIPSERVE_PARSER_S")),
@@ -138,7 +115,6 @@ def test_cpu_time_is_limited_while_others_are_read(settings):
 
 def test_reader_sees_no_environment_or_files_of_the_service(settings, monkeypatch):
     monkeypatch.setenv("LIPSERVE_DATABASE_URL", "postgresql://secret")
-    monkeypatch.setattr(cage, "_spawner", cage._Spawner())  # the new spawner is started with this variable
     seen = call("environment", str, settings=settings.model_copy(update={"database_url": "postgresql://secret"}))
     assert "LANG" in seen
     assert "secret" not in seen
@@ -171,83 +147,15 @@ def test_reader_opens_only_the_files_it_is_given(settings, tmp_path, action):
     assert secret.read_text() == "key"
 
 
-def spawner_process(settings):
-    """Return the process of the spawner, which has read a file."""
-    assert call("write_output", int, 0, settings=settings) == 7
-    return cage._spawner._process
-
-
-def test_spawner_that_has_exited_is_replaced(settings):
-    process = spawner_process(settings)
-    process.kill()
-    process.wait()
-    assert spawner_process(settings).pid != process.pid
-
-
-@pytest.mark.slow
-def test_spawner_that_hangs_is_replaced(settings, caplog):
-    process = spawner_process(settings)
-    process.send_signal(signal.SIGSTOP)
-    hasty = settings.model_copy(update={"parser_s": 4.0})
-    with ThreadPoolExecutor() as pool:
-        waiting = [pool.submit(call, "write_output", int, 0, settings=hasty) for _ in range(3)]
-        assert [each.result() for each in waiting] == [7, 7, 7]
-    assert process.wait(60) == -signal.SIGKILL
-    assert "hangs and is killed: it has made no progress for 4 s" in caplog.text
-
-
-def test_spawner_exits_with_its_parent(settings):
-    process = spawner_process(settings)
-    eventually(lambda: _confined_processes(process.pid))
-    others = [*children(process.pid), *_confined_processes(process.pid)]
-    cage._spawner._control.close()
-    assert process.wait(60) == 0
-    eventually(lambda: not any(map(_is_running, others)))
-
-
-def _is_running(pid):
-    """Return whether a process exists and is no zombie."""
-    try:
-        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
 def test_call_fails_if_no_process_can_be_started(settings, monkeypatch):
-    monkeypatch.setattr(cage, "_spawner", cage._Spawner())
-    monkeypatch.setattr(cage, "start", Mock(side_effect=BlockingIOError(11, "Resource temporarily unavailable")))
+    start = Mock(side_effect=BlockingIOError(11, "Resource temporarily unavailable"))
+    monkeypatch.setattr(cage, "_context", lambda: Mock(Process=lambda **_: Mock(start=start)))
     assert "uploads cannot be read at present" in failure_message("text", settings=settings, error=NotReadyError)
 
 
-def test_lost_caller_ends_its_process(settings, monkeypatch):
-    """The reader sleeps for an hour; the connection of the thread that waits for it breaks."""
-    connections = []
-
-    class WatchedSpawner(cage._Spawner):
-        def connect(self):
-            connection, process = super().connect()
-            connections.append(connection)
-            return connection, process
-
-    own = WatchedSpawner()
-    monkeypatch.setattr(cage, "_spawner", own)
-    with ThreadPoolExecutor() as pool:
-        waiting = pool.submit(failure_message, "sleep", settings=settings, error=NotReadyError)
-        for _ in range(2):
-            eventually(lambda: connections and len(_confined_processes(own._process.pid)) == 2)
-            connections.pop().shutdown(socket.SHUT_RDWR)
-        assert "uploads cannot be read at present" in waiting.result()
-    eventually(lambda: len(_confined_processes(own._process.pid)) == 1)
-
-
-def _confined_processes(pid):
-    """Return the processes that read a file, and the one that is ready for the next file."""
-    return [each for child in children(pid) for each in children(child)]
-
-
 def test_missing_extra_is_named(settings):
-    failure = Failure("extra", "", [("ingest", "pyarrow", "")])
-    error = cage._error(failure, "reader", "file", settings)
+    answer = cage.Answer(error="extra", detail=[("ingest", "pyarrow", "")])
+    error = cage._error(answer, "reader", "file", settings)
     assert isinstance(error, MissingExtraError)
     assert "lipserve[ingest]" in str(error)
 
@@ -255,7 +163,7 @@ def test_missing_extra_is_named(settings):
 @pytest.mark.parametrize(("machine", "place"), [(0xC000003E, 0), (0xC00000B7, 1)])
 def test_filter_decides_each_system_call_as_its_tables_do(machine, place):
     """Interpret the filter program for each listed system call and for some that are not listed."""
-    program = build_filter(machine, place, 4242)
+    program = build_filter(machine, place)
 
     def answer(number, first=0, seen=machine):
         at = accumulator = 0
@@ -270,11 +178,9 @@ def test_filter_decides_each_system_call_as_its_tables_do(machine, place):
                 at += yes if true else no
             at += 1
 
-    for numbers in FORBIDDEN_CALLS.values():
+    for numbers in FORBIDDEN.values():
         if numbers[place] is not None:
             assert answer(numbers[place]) == "error 1"
-    for numbers in SELF_ONLY_CALLS.values():
-        assert [answer(numbers[place], pid) for pid in (4242, 0, 1)] == ["allow", "allow", "error 1"]
     clone = (56, 220)[place]
     assert [answer(clone, flags) for flags in (0x10000 | 0x100, 17)] == ["allow", "error 1"]
     assert answer(435) == "error 38"
