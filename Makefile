@@ -10,7 +10,7 @@ TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test warm-lip warm-chain bytecode test-all nightly screenshots fuzz cpp lint install install-all serve image image-serve docs dist sbom clean
+.PHONY: demo test warm-lip warm-chain bytecode test-all nightly screenshots fuzz fuzz-long cpp lint install install-all serve image image-serve docs dist sbom clean
 
 demo: $(VENV)/.running
 	$(BIN)/lipserve demo
@@ -62,11 +62,14 @@ screenshots: install-all
 	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/system/browser/test_journey.py tests/system/browser/test_arm.py tests/system/browser/test_payload.py
 
 # fuzzes the readers of uploads with Atheris, each for SECONDS; findings go to build/fuzz
-FUZZ := csv json json_lines npz parquet feather hdf5 npy xlsx gzip yaml rosbag1 rosbag2 mcap zip urdf archive manifest tensors
+FUZZ ?= csv json json_lines npz parquet feather hdf5 npy xlsx gzip yaml rosbag1 rosbag2 mcap zip urdf archive manifest tensors
 SECONDS ?= 60
 fuzz: install-all
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e '.[fuzz]'
 	failed=0; for each in $(FUZZ); do $(BIN)/python -m tests.fuzz $$each $(SECONDS) || failed=1; done; exit $$failed
+
+fuzz-long:
+	$(MAKE) fuzz SECONDS=1800
 
 # builds example and test of the C++ client; needs CMake and a C++17 compiler
 cpp:
