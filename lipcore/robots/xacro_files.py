@@ -18,7 +18,7 @@ from lipcore.extras import import_extra
 from lipcore.robots.urdf_text import UrdfError
 
 MAX_FILES = 2000
-ENDINGS = (".xacro", ".urdf", ".xml")
+ENDINGS = (".xacro", ".urdf", ".xml", ".sdf")
 _INCLUDE = re.compile(r"""<xacro:include\b[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
 _ARGUMENT = re.compile(r"""<xacro:arg\b[^>]*\bname\s*=\s*["'](\w+)["']""")
 _TODO = "Expand it where its packages are installed: xacro robot.urdf.xacro > robot.urdf"
@@ -44,7 +44,11 @@ def unpack_description(archive: Path, folder: Path, max_bytes: int) -> Path:
         raise UrdfError(f"the zip cannot be read: {error}") from None
     found = {path: _read(path) for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix in ENDINGS}
     included = {os.path.basename(name) for text in found.values() for name in _INCLUDE.findall(text)}
-    robots = [path for path, text in found.items() if "<robot" in text and path.name not in included]
+    robots = [
+        path
+        for path, text in found.items()
+        if any(each in text for each in ("<robot", "<sdf", "<mujoco")) and path.name not in included
+    ]
     plain = [path for path in robots if not is_xacro(found[path])]
     robots = plain if len(plain) == 1 else robots
     if len(robots) != 1:

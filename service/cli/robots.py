@@ -61,7 +61,7 @@ def add(
     path: Annotated[
         Path,
         typer.Argument(
-            help="A .urdf, .xacro or MuJoCo .xml file, or the zip of its folder.", exists=True, dir_okay=False
+            help="A .urdf, .xacro, .sdf or MuJoCo .xml file, or the zip of its folder.", exists=True, dir_okay=False
         ),
     ],
     scale: Annotated[
@@ -75,8 +75,8 @@ def add(
     as_json: Json = False,
 ) -> None:
     """Upload a robot for use with recordings and training."""
-    if path.suffix not in (".urdf", ".xacro", ".xml", ".zip"):
-        raise CommandError(f"{str(path)!r} is no .urdf, .xacro or .zip file, or .xml in MuJoCo's format")
+    if path.suffix not in (".urdf", ".xacro", ".sdf", ".xml", ".zip"):
+        raise CommandError(f"{str(path)!r} is no .urdf, .xacro, .sdf or .zip file, or .xml in MuJoCo's format")
     factors = pairs("--scale", [part for each in scale or () for part in each.split(",")])
     with connected(url) as client:
         units = {name: float(text) for name, text in factors.items()}

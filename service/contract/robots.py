@@ -69,8 +69,8 @@ class ProfileList(BaseModel):
 
 
 UPLOAD_BODY = upload_body(
-    "A robot with a fixed base: a URDF, a xacro, MuJoCo's MJCF, or the zip of a folder with one of them and the files "
-    "that it includes. Meshes are not needed. Joints are matched to the data by name.",
+    "A robot with a fixed base: a URDF, a xacro, an SDF, MuJoCo's MJCF, or the zip of a folder with one of them and the "
+    "files that it includes. Meshes are not needed. Joints are matched to the data by name.",
     {
         "application/xml": {
             "schema": {"type": "string"},
@@ -82,5 +82,5 @@ UPLOAD_BODY = upload_body(
         "text/xml": {"schema": {"type": "string"}},
         "application/zip": {"schema": BINARY},
     },
-    "A .urdf, .xacro, .xml or .zip file",
+    "A .urdf, .xacro, .sdf, .xml or .zip file",
 )

@@ -11,6 +11,7 @@ from lipcore.profiles.profile import read_limits
 from lipcore.robots import urdf_text, urdf_units
 from lipcore.robots.library import pinocchio
 from lipcore.robots.mjcf import convert_mjcf, is_mjcf
+from lipcore.robots.sdf import convert_sdf, is_sdf
 from lipcore.robots.urdf import Description, describe
 from lipcore.robots.urdf_text import UrdfError
 from lipcore.robots.urdf_units import Scale
@@ -33,7 +34,7 @@ class ReadUrdf:
 
 
 def read_robot(upload: Path, scale: dict[str, float], xacro: dict[str, str], folder: Path, max_bytes: int) -> ReadUrdf:
-    """Return a robot as URDF in SI units: a URDF, MJCF or xacro, or a zip of a folder with one of them.
+    """Return a robot as URDF in SI units: a URDF, SDF, MJCF or xacro, or a zip of a folder with one of them.
 
     scale: factors of its quantities; xacro: arguments; folder: for temporary files; max_bytes: of the files in a zip.
     Raise InvalidDataError naming the error in it.
@@ -49,6 +50,8 @@ def read_robot(upload: Path, scale: dict[str, float], xacro: dict[str, str], fol
         urdf = _decode(file.read_bytes())
         if is_mjcf(urdf):
             urdf = convert_mjcf(urdf, folder)
+        elif is_sdf(urdf):
+            urdf = convert_sdf(urdf)
         elif is_xacro(urdf):
             urdf = expand_xacro(file, files, xacro)
         if scale:

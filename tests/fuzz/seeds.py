@@ -42,6 +42,12 @@ LINK = """<link name="l{1}"><inertial><origin xyz="0 0 0.1" rpy="0 0 0"/><mass v
 <joint name="j{1}" type="revolute"><parent link="{0}"/><child link="l{1}"/><axis xyz="0 1 0"/>
 <limit lower="-2" upper="2" effort="10" velocity="3"/></joint>"""
 
+SDF = """<sdf version="1.9"><model name="m"><link name="a"/><link name="b"><pose relative_to="a">0 0 1 0 1 0</pose>
+<inertial><pose>0 0 .1 0 0 0</pose><mass>1</mass><inertia><ixx>1</ixx><iyy>1</iyy><izz>1</izz></inertia></inertial>
+</link>
+<joint name="j" type="revolute"><parent>a</parent><child>b</child><axis><xyz expressed_in="__model__">0 1 0</xyz><limit>
+<lower>-1</lower><upper>1</upper><effort>9</effort></limit></axis></joint></model></sdf>"""
+
 
 def seeds() -> Iterator[tuple[str, bytes]]:
     """Yield the target and the content of each file."""
@@ -82,6 +88,7 @@ def seeds() -> Iterator[tuple[str, bytes]]:
     texts = {"positions.txt": _text("q"), "velocities.txt": _text("dq"), "torques.txt": _text("tau")}
     yield "zip", zipped(texts, zipfile.ZIP_STORED)
     yield "zip", _lerobot()
+    yield "urdf", SDF.encode()
     yield "urdf", URDF.format(LINK.format("base", 1) + LINK.format("l1", 2)).encode()
     yield from _models()
 

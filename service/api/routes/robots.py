@@ -51,13 +51,13 @@ async def upload(
         str | None, Query(max_length=1000, description="Arguments of a xacro: `ur_type=ur5e,name=ur`")
     ] = None,
 ) -> Robot:
-    """Check a URDF and store it as a robot; MJCF is converted and xacro expanded. Meshes are not opened.
+    """Check a URDF and store it as a robot; SDF and MJCF are converted, xacro is expanded. Meshes are not opened.
 
     A wrong URDF is rejected: `detail` names what is wrong.
     """
     kinds = Kinds(
         dict.fromkeys(("application/xml", "text/xml", "application/zip"), "urdf"),
-        dict.fromkeys((".urdf", ".xml", ".xacro", ".zip"), "urdf"),
+        dict.fromkeys((".urdf", ".sdf", ".xml", ".xacro", ".zip"), "urdf"),
     )
     _, content = await receive(request, kinds)
     await to_thread.run_sync(storage.disk.reserve, len(content))

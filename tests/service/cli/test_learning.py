@@ -138,4 +138,4 @@ def test_robots_are_added_listed_shown_and_deleted(run_command, run_rejected_com
     assert "7 joints" in run_command("robots", "show", "panda")
     assert f"{robot} deleted" in run_command("robots", "delete", robot, "--yes")
     assert "no robot" in run_rejected_command("robots", "show", robot)
-    assert "is no .urdf, .xacro or .zip file" in run_rejected_command("robots", "add", Path(__file__))
+    assert "is no .urdf, .xacro, .sdf or .zip file" in run_rejected_command("robots", "add", Path(__file__))

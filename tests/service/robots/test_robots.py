@@ -17,6 +17,7 @@ from service.foundation.errors import InvalidRequestError
 from service.models import registry
 from service.robots import store
 from service.storage.database import RobotRow
+from tests.fuzz.seeds import SDF
 from tests.service.cli.conftest import lipserve  # noqa: F401 - a fixture
 from tests.service.data import QUICK, columns, error, post, queue, service_of, stream, train, upload
 from tests.service.data import csv as csv_file
@@ -282,6 +283,7 @@ def test_xacro_and_a_zip_of_its_folder_are_expanded(api):
     joints = add_robot(api, plain.encode())["joints"]
     assert add_robot(api, f"{start}{inside}{end}".encode())["joints"] == joints
     assert add_robot(api, out.getvalue(), media_type="application/zip")["joints"] == joints
+    assert add_robot(api, SDF.encode())["joints"] == [{"name": "j", "type": "revolute"}]
     wrong = f"{start}{inside}<link name=\"${{open('/etc/passwd').read()}}\"/></robot>"
     message = error(post_robot(api, wrong.encode()), 422, "invalid_data")["message"]
     assert "xacro cannot expand robot.xacro" in message

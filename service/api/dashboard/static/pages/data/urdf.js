@@ -8,7 +8,7 @@ import { button, errorBox, notice } from "../../ui.js";
 
 /** Create a button that uploads a URDF and then calls onAdded(robot). Errors are shown below it. */
 export function urdfButton(onAdded) {
-  const input = h("input", { type: "file", accept: ".urdf,.xacro,.xml,.zip", hidden: true, "aria-label": "URDF to upload" });
+  const input = h("input", { type: "file", accept: ".urdf,.xacro,.sdf,.xml,.zip", hidden: true, "aria-label": "URDF to upload" });
   const problem = h("div", {});
   // scale: factors to SI units that an error message proposed
   const send = async (file, scale) => {
