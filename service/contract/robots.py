@@ -69,8 +69,8 @@ class ProfileList(BaseModel):
 
 
 UPLOAD_BODY = upload_body(
-    "A robot with a fixed base: a URDF, a xacro, an SDF, MuJoCo's MJCF, or the zip of a folder with one of them and the "
-    "files that it includes. Meshes are not needed. Joints are matched to the data by name.",
+    "A robot with a fixed base: a URDF, a xacro, an SDF, MuJoCo's MJCF, or the zip of a folder with one of them and "
+    "the files that it includes. Meshes are not needed. Joints are matched to the data by name.",
     {
         "application/xml": {
             "schema": {"type": "string"},

@@ -48,6 +48,12 @@ SDF = """<sdf version="1.9"><model name="m"><link name="a"/><link name="b"><pose
 <joint name="j" type="revolute"><parent>a</parent><child>b</child><axis><xyz expressed_in="__model__">0 1 0</xyz><limit>
 <lower>-1</lower><upper>1</upper><effort>9</effort></limit></axis></joint></model></sdf>"""
 
+XACRO = """<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arg name="m" default="2"/>
+<xacro:property name="l" value="${2 * pi}"/><xacro:macro name="link" params="n *o"><link name="${n}"><inertial>
+<xacro:insert_block name="o"/><mass value="$(arg m)"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+</link></xacro:macro><link name="a"/><xacro:link n="b"><origin xyz="0 0 ${l}"/></xacro:link><xacro:if value="${l > 1}">
+<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></xacro:if></robot>"""
+
 
 def seeds() -> Iterator[tuple[str, bytes]]:
     """Yield the target and the content of each file."""
@@ -89,6 +95,7 @@ def seeds() -> Iterator[tuple[str, bytes]]:
     yield "zip", zipped(texts, zipfile.ZIP_STORED)
     yield "zip", _lerobot()
     yield "urdf", SDF.encode()
+    yield "urdf", XACRO.encode()
     yield "urdf", URDF.format(LINK.format("base", 1) + LINK.format("l1", 2)).encode()
     yield from _models()
 
