@@ -157,8 +157,8 @@ def find(database: Database, dataset: str) -> DatasetRow:
         return existing(session, dataset)
 
 
-def existing(session: Session, dataset: str) -> DatasetRow:
-    """Return the row as `find` does, in a session."""
+def existing(session: Session, dataset: str, only: bool = False) -> DatasetRow:
+    """Return the row as `find` does, in a session. only: whether to reject a name of several readings, too."""
     row = session.scalar(select(DatasetRow).where(DatasetRow.id == dataset))
     if row is not None:
         return row
@@ -168,7 +168,7 @@ def existing(session: Session, dataset: str) -> DatasetRow:
     rows = list(session.scalars(called))
     if not rows:
         raise not_found("dataset", dataset)
-    if len({row.report.get("upload_sha256") or row.id for row in rows}) > 1:
+    if len({row.id if only else row.report.get("upload_sha256") or row.id for row in rows}) > 1:
         ids = ", ".join(each.id for each in rows[:MAX_LISTED_IDS]) + (" …" if len(rows) > MAX_LISTED_IDS else "")
         message = f"Several data sets are named {dataset!r}. Use one of their ids: {ids}."
         raise invalid_request("dataset", dataset, f"one of the ids {ids}", message)
@@ -206,7 +206,7 @@ def page(database: Database, part: Page, upload_sha256: str | None = None) -> Da
 def delete(storage: Storage, dataset: str) -> None:
     """Delete a data set; raise ConflictError if a queued or running job needs it."""
     with storage.database.transaction() as session:
-        row = existing(session, dataset)
+        row = existing(session, dataset, only=True)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
             if row.id in job.request["datasets"]:
                 raise ConflictError(

@@ -50,9 +50,10 @@ SDF = """<sdf version="1.9"><model name="m"><link name="a"/><link name="b"><pose
 
 XACRO = """<robot name="x" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arg name="m" default="2"/>
 <xacro:property name="l" value="${2 * pi}"/><xacro:macro name="link" params="n *o"><link name="${n}"><inertial>
-<xacro:insert_block name="o"/><mass value="$(arg m)"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
-</link></xacro:macro><link name="a"/><xacro:link n="b"><origin xyz="0 0 ${l}"/></xacro:link><xacro:if value="${l > 1}">
-<joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></xacro:if></robot>"""
+<xacro:insert_block name="o"/><mass value="$(arg m)"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
+</inertial></link></xacro:macro><link name="a"/><xacro:link n="b"><origin xyz="0 0 ${l}"/></xacro:link>
+<xacro:if value="${l > 1}"><joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint>
+</xacro:if></robot>"""
 
 
 def seeds() -> Iterator[tuple[str, bytes]]:

@@ -103,13 +103,12 @@ def test_file_is_found_as_its_existing_data_set(run_command, run_rejected_comman
     assert job["datasets"] == [made["id"]]
     server.client.post(f"/v1/jobs/{job['id']}/cancel")
     assert ended(server.client, job["id"])["state"]
-    run_command("data", "add", path, "--name", "plain")
-    message, hint = run_rejected_command("evaluate", "panda-sim", path).splitlines()
-    ways = "read-before.csv was uploaded before and read in 2 different ways: give the id of one data set: ds_"
-    assert lacking(message, ways, f"{made['id']} (no robot, ") == []
-    assert "`lipserve data show ID`" in hint
-    run_command("data", "delete", "plain", "--yes")
     assert "are shoulder, elbow" in run_rejected_command("evaluate", "panda-sim", path)
+    run_command("data", "add", path, "--name", "plain")
+    assert "are joint1, joint2" in run_rejected_command("evaluate", "panda-sim", path)  # the newest reading
+    again = run_command("data", "add", made["id"], "--joint-names", "a,b", "--json")
+    assert "are a, b" in run_rejected_command("evaluate", "panda-sim", path)
+    assert again["report"]["upload_sha256"] == made["report"]["upload_sha256"]
 
 
 @pytest.mark.slow
@@ -119,6 +118,7 @@ def test_data_sets_can_be_given_by_name(run_command, run_rejected_command, arm, 
     assert run_command("data", "show", "by name", "--json") == made
     assert run_command("evaluate", arm[0], "by name", "--json")["dataset"] == made["id"]
     other = run_command("data", "add", path, "--name", "by name", "--cutoff", 3, "--filtering", "always", "--json")
+    assert run_command("data", "show", "by name", "--json") == other  # the newest reading of this file
     message = run_rejected_command("data", "delete", "by name", "--yes")
     assert f"Use one of their ids: {other['id']}, {made['id']}" in message
     run_command("data", "delete", made["id"], "--yes")
