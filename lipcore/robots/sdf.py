@@ -46,7 +46,10 @@ class _Depth:
 def convert_sdf(text: str) -> str:
     """Return the URDF of the one model in an SDF; raise UrdfError."""
     scan(text, "SDF", _Depth())
-    root = ElementTree.fromstring(text)  # noqa: S314 - document types are refused above
+    try:
+        root = ElementTree.fromstring(text)  # noqa: S314 - document types are refused above
+    except ElementTree.ParseError as error:
+        raise UrdfError(f"the SDF is not well-formed XML: {error}") from None
     models = list(root.iter("model"))
     if len(models) != 1:
         raise UrdfError(f"the SDF has {len(models)} models, expected one, without nested models")
