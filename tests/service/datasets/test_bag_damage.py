@@ -80,7 +80,7 @@ def test_bag_with_changed_bytes_is_read_or_rejected(bag, tmp_path, data):
         raw[data.draw(st.integers(0, len(raw) - 1))] = data.draw(st.integers(0, 255))
     broken = tmp_path / "broken"
     broken.write_bytes(bytes(raw))
-    with suppress(InvalidDataError, InvalidRequestError, TooLargeError):
+    with suppress(InvalidDataError, InvalidRequestError, TooLargeError, MemoryError):  # the confined process limits it
         read(broken)
     assert not [each for each in tmp_path.iterdir() if each.is_dir()]
 

@@ -136,6 +136,23 @@ def test_faster_topic_is_interpolated_and_gaps_stay_empty(tmp_path):
     np.testing.assert_allclose(result["joint1/position"], NUMBERS[:, 0, 0])
 
 
+def test_topics_with_and_without_stamps_are_merged_by_their_reception(tmp_path):
+    """Stamps of a simulation, beside messages without."""
+    array = "std_msgs/msg/Float64MultiArray"
+    rows = [
+        {"name": [f"j{j}" for j in range(7)], "position": each[0], "header": {"stamp": {"sec": 5 + k, "nanosec": 0}}}
+        for k, each in enumerate(NUMBERS)
+    ]
+    topics = {
+        "/joint_states": (bags.JOINT_STATE, "", rows),
+        "/joint_torques": (array, "", [{"data": each[2]} for each in NUMBERS]),
+    }
+    check(read(write(tmp_path / "a.db3", ROS2, topics)), quantities=(0, 2))
+    topics["/joint_torques"] = (array, "", [{"data": each[2][:6]} for each in NUMBERS])
+    with pytest.raises(InvalidDataError, match=r"topic /joint_torques has other joints .* Choose other topics"):
+        read(write(tmp_path / "b.db3", ROS2, topics))
+
+
 def test_lbr_state_is_read_as_measured(tmp_path):
     rows = [
         {

@@ -5,6 +5,7 @@ No index is used, so recordings that were cut off are read up to their end.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterator
 from io import BytesIO
@@ -129,7 +130,8 @@ def _unpacked(data: bytes) -> bytes:
 def _read_mcap(file: BinaryIO) -> Messages:
     schemas: dict[int, records.Schema] = {}
     topics: dict[int, Topic] = {}
-    for record in StreamReader(file, validate_crcs=True).records:
+    size = os.fstat(file.fileno()).st_size
+    for record in StreamReader(file, validate_crcs=True, record_size_limit=size).records:
         if isinstance(record, records.Message):
             topic = topics[record.channel_id]
             yield topic, record.log_time, _unpacked(record.data) if topic.encoding == "cdr" else record.data

@@ -19,7 +19,7 @@ from service.datasets.formats.bags.source import NS, Samples, Source
 from service.datasets.formats.table import Table, clean_names, first_line, stack_blocks, unreadable
 from service.datasets.formats.zips import unpack_bag
 from service.datasets.options import ReadOptions
-from service.foundation.errors import ServiceError, invalid_data, invalid_request, readable
+from service.foundation.errors import InvalidDataError, ServiceError, invalid_data, invalid_request, readable
 from service.foundation.settings import Settings
 
 JOINT_STATE = "sensor_msgs/JointState"
@@ -61,8 +61,16 @@ def open_bag(path: Path, options: ReadOptions, settings: Settings) -> Iterator[T
             if topic in by_topic:
                 by_topic[topic].collect(received, data, settings)
         samples = [sources[0].arrange(options.joint_names, settings)]
-        samples += [each.arrange(samples[0].joints, settings) for each in sources[1:]]
+        samples += [_matching(each, sources[0], samples[0].joints, settings) for each in sources[1:]]
         yield _table(sources, samples, [*bag.facts, *chosen])
+
+
+def _matching(source: Source, first: Source, joints: tuple[str, ...], settings: Settings) -> Samples:
+    try:
+        return source.arrange(joints, settings)
+    except InvalidDataError as error:
+        expected = f"those of topic {first.topic.name}, {', '.join(joints)[:200]}. Choose other topics with `topic`"
+        raise source.error(f"other joints ({error.message})", expected) from None
 
 
 def _table(sources: Sequence[Source], samples: Sequence[Samples], facts: list[str]) -> Table:
@@ -92,19 +100,22 @@ def _table(sources: Sequence[Source], samples: Sequence[Samples], facts: list[st
 def _merge(samples: Sequence[Samples]) -> tuple[NDArray[np.int64], dict[str, Array]]:
     """Return the times of the topic with the fewest messages, and all numbers at these times.
 
-    Numbers of other topics are interpolated, NaN if their neighbours are far apart.
+    Numbers of other topics are interpolated, NaN if their neighbours are far apart. The times are header stamps only if
+    all topics have them.
     """
     if len(samples) == 1:
         return samples[0].times, dict(samples[0].values)
-    slowest = min(samples, key=lambda each: len(each.times))
-    begin, end = max(each.times.min() for each in samples), min(each.times.max() for each in samples)
-    times = np.sort(slowest.times[(slowest.times >= begin) & (slowest.times <= end)])
+    stamped = all(each.stamped for each in samples)
+    clocks = [each.times if stamped else each.received for each in samples]
+    slowest = min(clocks, key=len)
+    begin, end = max(each.min() for each in clocks), min(each.max() for each in clocks)
+    times = np.sort(slowest[(slowest >= begin) & (slowest <= end)])
     if not len(times):
         raise invalid_data("topic", "topics that were recorded at different times", "topics of the same time")
     values = {}
-    for each in samples:
-        order = np.argsort(each.times, kind="stable")
-        known = (each.times[order] - times[0]).astype(float)
+    for each, clock in zip(samples, clocks, strict=True):
+        order = np.argsort(clock, kind="stable")
+        known = (clock[order] - times[0]).astype(float)
         at = (times - times[0]).astype(float)
         right = np.clip(np.searchsorted(known, at), 1, max(len(known) - 1, 1))
         gaps = np.diff(known, append=known[-1])

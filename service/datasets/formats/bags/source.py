@@ -28,9 +28,14 @@ NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Samples:
-    """The numbers of a topic. times: (N,) ns; values: (N, n) by quantity, NaN where a message has none."""
+    """The numbers of a topic: values (N, n) by quantity, NaN where a message has none."""
 
     times: NDArray[np.int64]
+    """Header stamps or times of reception, ns, (N,)."""
+    received: NDArray[np.int64]
+    """Times of reception, ns, (N,); they may not rise."""
+    stamped: bool
+    """Whether `times` are header stamps."""
     joints: tuple[str, ...]
     values: Mapping[str, Array]
     facts: tuple[str, ...]
@@ -45,8 +50,9 @@ class Source:
     fields: JointFields
     quantities: tuple[str, ...]
     """The quantities that are read; a message without the first one is not read."""
-    kinds: dict[tuple[Any, ...], MessageKind] = field(default_factory=dict)
-    """By the joint names and the number of values of each quantity."""
+    kinds: list[MessageKind] = field(default_factory=list)
+    indices: dict[tuple[Any, ...], int] = field(default_factory=dict)
+    """Index of a kind by the joint names and the number of values of each quantity."""
     numbers: list[array[float]] = field(default_factory=list)
     """Numbers of the messages of each kind, one message after the other."""
     kind: array[int] = field(default_factory=lambda: array("i"))
@@ -66,7 +72,7 @@ class Source:
             form = (names, *map(len, values))
             index = self._index_of(form)
             for each in values:
-                if self.kinds[form].quantities:
+                if self.kinds[index].quantities:
                     self.numbers[index].frombytes(np.asarray(each, np.float64).tobytes())
             self.kind.append(index)
         except (InvalidDataError, MemoryError):
@@ -75,12 +81,13 @@ class Source:
             raise unreadable(self._message(), first_line(error), f"a {self.topic.type}") from None
 
     def _index_of(self, form: tuple[Any, ...]) -> int:
-        if form not in self.kinds:
-            self.kinds[form] = self._kind(*form)
+        if form not in self.indices:
+            self.indices[form] = len(self.kinds)
+            self.kinds.append(self._kind(*form))
             self.numbers.append(array("d"))
             if len(self.kinds) > MAX_KINDS:
                 raise self.error(f"more than {MAX_KINDS} sets of joints", f"at most {MAX_KINDS}")
-        return list(self.kinds).index(form) if len(self.kinds) > 1 else 0
+        return self.indices[form]
 
     def _kind(self, names: tuple[str, ...], *counts: int) -> MessageKind:
         joints = names or tuple(f"joint{joint + 1}" for joint in range(counts[0]))
@@ -97,7 +104,7 @@ class Source:
         """Return the numbers of the joints: those `given`, or those of most messages; raise InvalidDataError."""
         if not self.kind:
             raise self.error("no messages", "at least one")
-        kinds, kind = list(self.kinds.values()), np.array(self.kind)
+        kinds, kind = self.kinds, np.array(self.kind)
         counts = np.bincount(kind, minlength=len(kinds)).tolist()
         named = any(each.named for each in kinds)
         joints = names = choose_joints(kinds, counts, given if named else None, self.topic.name)
@@ -129,6 +136,8 @@ class Source:
         facts.append(f"times are {times_of}")
         return Samples(
             stamps if use_stamps else received,
+            received,
+            use_stamps,
             names,
             {each: values[each][kept] for each in self.quantities if holding[each]},
             tuple(facts),
