@@ -39,7 +39,7 @@ SHARED := $(addprefix tests/service/, \
 	api/access/test_keys.py api/access/test_scopes.py api/access/test_commands.py api/bad_requests \
 	api/test_metrics_of_service.py telemetry/test_readiness.py inference/test_predicting.py inference/test_evaluating.py \
 	training/test_job_requests.py training/test_training.py training/test_cancelling.py robots/test_robots.py \
-	datasets/test_uploads.py learning/test_observations.py learning/test_learning_routes.py learning/test_undoing.py \
+	datasets/test_uploads.py datasets/test_reading_again.py learning/test_observations.py learning/test_learning_routes.py learning/test_undoing.py \
 	learning/test_inspection.py learning/test_log.py) tests/clients/python/test_idempotency.py
 
 # seconds of recorded histories (tests/system/histories): half on SQLite, half on three services
