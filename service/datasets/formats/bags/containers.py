@@ -12,7 +12,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import zstandard
 from mcap import records
 from mcap.exceptions import EndOfFile
 from mcap.stream_reader import StreamReader
@@ -20,6 +19,7 @@ from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_bytes
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from service.datasets.formats.table import first_line, unreadable
+from service.datasets.formats.zips import decompress
 from service.foundation.errors import InvalidDataError, ServiceError, invalid_data
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -124,7 +124,7 @@ def _read_sqlite(file: BinaryIO) -> Messages:
 
 def _unpacked(data: bytes) -> bytes:
     """Return a message, decompressed if rosbag2 has compressed it."""
-    return zstandard.ZstdDecompressor().decompressobj().decompress(data) if data.startswith(ZSTD_MAGIC) else data
+    return bytes(decompress(BytesIO(data), "zstd").read()) if data.startswith(ZSTD_MAGIC) else data
 
 
 def _read_mcap(file: BinaryIO) -> Messages:
