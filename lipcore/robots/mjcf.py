@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lipcore.robots.library import pinocchio
-from lipcore.robots.urdf_text import MAX_DEPTH, UrdfError, scan
+from lipcore.robots.urdf_text import MAX_DEPTH, UrdfError, add_origin, join_numbers, scan
 
 PROBE = """<mujoco model="probe"><worldbody><body name="a"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
 <joint name="b" type="slide" range="0 1"/></body></worldbody></mujoco>"""
@@ -100,7 +100,7 @@ def _urdf_of(model: Any, name: str, slide: float) -> str:
         if inertia.mass <= 0:
             raise UrdfError(f"the body that joint {joint!r} moves has no mass, expected an <inertial>")
         body = ElementTree.SubElement(ElementTree.SubElement(root, "link", name=links[index]), "inertial")
-        _origin(body, inertia.lever, np.eye(3))
+        add_origin(body, inertia.lever, np.eye(3))
         ElementTree.SubElement(body, "mass", value=f"{inertia.mass:.12g}")
         parts = {f"i{'xyz'[a]}{'xyz'[b]}": f"{inertia.inertia[a, b]:.12g}" for a in range(3) for b in range(a, 3)}
         ElementTree.SubElement(body, "inertia", parts)
@@ -111,10 +111,10 @@ def _urdf_of(model: Any, name: str, slide: float) -> str:
         what = ("revolute" if bounded else "continuous") if turns else "prismatic"
         element = ElementTree.SubElement(root, "joint", name=joint, type=what)
         place = model.jointPlacements[index]
-        _origin(element, place.translation, place.rotation)
+        add_origin(element, place.translation, place.rotation)
         ElementTree.SubElement(element, "parent", link=links[model.parents[index]])
         ElementTree.SubElement(element, "child", link=links[index])
-        ElementTree.SubElement(element, "axis", xyz=_numbers(motion[3:] if turns else motion[:3]))
+        ElementTree.SubElement(element, "axis", xyz=join_numbers(motion[3:] if turns else motion[:3]))
         factor = 1.0 if turns else slide
         limits = {"lower": factor * lower, "upper": factor * upper} if bounded else {}
         limits |= {"effort": float(model.effortLimit[kind.idx_v]), "velocity": float(model.velocityLimit[kind.idx_v])}
@@ -128,12 +128,3 @@ def _is_finite(text: str) -> bool:
         return bool(np.isfinite(float(text)))
     except ValueError:
         return False
-
-
-def _origin(element: ElementTree.Element, place: Any, rotation: Any) -> None:
-    angles = pinocchio().rpy.matrixToRpy(np.array(rotation))
-    ElementTree.SubElement(element, "origin", xyz=_numbers(place), rpy=_numbers(angles))
-
-
-def _numbers(values: Any) -> str:
-    return " ".join(f"{float(value):.12g}" for value in values)

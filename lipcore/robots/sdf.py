@@ -14,7 +14,8 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.robots.urdf_text import MAX_DEPTH, UrdfError, scan
+from lipcore.robots.library import pinocchio
+from lipcore.robots.urdf_text import MAX_DEPTH, UrdfError, add_origin, join_numbers, scan
 
 KINDS = {"revolute": "revolute", "prismatic": "prismatic", "continuous": "continuous", "fixed": "fixed"}
 UNBOUNDED = 1e16
@@ -68,7 +69,7 @@ def convert_sdf(text: str) -> str:
         made = SubElement(out, "link", name=name)
         if inertial is not None:
             body = SubElement(made, "inertial")
-            _origin(body, np.linalg.solve(frame, frames.of(name) @ _pose(inertial)))
+            _add_pose(body, np.linalg.solve(frame, frames.of(name) @ _pose(inertial)))
             SubElement(body, "mass", value=_text(inertial, "mass", "1"))
             inertia = inertial.find("inertia")
             diagonal = {"ixx": "1", "iyy": "1", "izz": "1"} if inertia is None else {}
@@ -105,11 +106,11 @@ def _add_joint(out: Element, joint: Element, frames: _Frames, moved: dict[str, E
         force = {key: given.get(key, -1.0) for key in ("effort", "velocity")}
         limits |= {key: f"{each:.12g}" if 0 <= each < UNBOUNDED else "0" for key, each in force.items()}
     element = SubElement(out, "joint", name=name, type=KINDS[kind])
-    _origin(element, np.linalg.solve(start, frames.of(name)))
+    _add_pose(element, np.linalg.solve(start, frames.of(name)))
     SubElement(element, "parent", link=parent)
     SubElement(element, "child", link=_text(joint, "child"))
     if kind != "fixed":
-        SubElement(element, "axis", xyz=" ".join(f"{each:.12g}" for each in direction))
+        SubElement(element, "axis", xyz=join_numbers(direction))
         SubElement(element, "limit", limits or {"effort": "0", "velocity": "0"})
 
 
@@ -145,25 +146,13 @@ def _pose(element: Element) -> Array:
     x, y, z, roll, pitch, yaw = _numbers(pose, "0 0 0 0 0 0", 6)
     if pose is not None and pose.get("degrees", "false") in ("1", "true"):
         roll, pitch, yaw = np.radians([roll, pitch, yaw])
-    (a, b, c), (d, e, f) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     out = np.eye(4)
-    out[:3] = [
-        [c * b, c * e * d - f * a, c * e * a + f * d, x],
-        [f * b, f * e * d + c * a, f * e * a - c * d, y],
-        [-e, b * d, b * a, z],
-    ]
+    out[:3, :3], out[:3, 3] = pinocchio().rpy.rpyToMatrix(roll, pitch, yaw), (x, y, z)
     return out
 
 
-def _origin(element: Element, pose: Any) -> None:
-    roll, pitch = np.arctan2(pose[2, 1], pose[2, 2]), np.arctan2(-pose[2, 0], np.hypot(pose[2, 1], pose[2, 2]))
-    sine, cosine = (
-        np.sin(roll),
-        np.cos(roll),
-    )  # the yaw matches this roll, also if the pitch is a right angle
-    yaw = np.arctan2(sine * pose[0, 2] - cosine * pose[0, 1], cosine * pose[1, 1] - sine * pose[1, 2])
-    xyz, rpy = (" ".join(f"{float(each):.12g}" for each in row) for row in (pose[:3, 3], (roll, pitch, yaw)))
-    SubElement(element, "origin", xyz=xyz, rpy=rpy)
+def _add_pose(element: Element, pose: Any) -> None:
+    add_origin(element, pose[:3, 3], pose[:3, :3])
 
 
 def _text(element: Element, tag: str, default: str = "") -> str:

@@ -17,6 +17,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from lipcore.robots.library import pinocchio
 from lipcore.vocabulary import JointType
 
 MOVABLE: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
@@ -216,3 +217,14 @@ def _numbers(text: str, count: int, largest: float, what: str) -> list[float]:
         several = f"{count} numbers" if count > 1 else "a number"
         raise UrdfError(f"{what} is {text[:80]!r}, expected {several} of at most {largest:g}")
     return numbers
+
+
+def add_origin(element: ElementTree.Element, place: Any, rotation: Any) -> None:
+    """Add the `<origin>` of a frame: its place (3,), m, and its rotation (3, 3)."""
+    angles = pinocchio().rpy.matrixToRpy(np.array(rotation))
+    ElementTree.SubElement(element, "origin", xyz=join_numbers(place), rpy=join_numbers(angles))
+
+
+def join_numbers(values: Any) -> str:
+    """Return the text of an attribute with several numbers."""
+    return " ".join(f"{float(value):.12g}" for value in values)

@@ -40,14 +40,8 @@ FORBIDDEN = {
     **{"vfork": (58, None), "ptrace": (101, 117), "process_vm_readv": (310, 270), "process_vm_writev": (311, 271)},
     **{"pidfd_open": (434, 434), "pidfd_getfd": (438, 438), "pidfd_send_signal": (424, 424), "kill": (62, 129)},
     **{"tkill": (200, 130), "tgkill": (234, 131), "rt_sigqueueinfo": (129, 138), "rt_tgsigqueueinfo": (297, 240)},
-    **{
-        "prlimit64": (302, 261),
-        "setpriority": (141, 140),
-        "unshare": (272, 97),
-        "setns": (308, 268),
-        "bpf": (321, 280),
-    },
-    **{"io_uring_setup": (425, 425)},
+    **{"prlimit64": (302, 261), "setpriority": (141, 140), "unshare": (272, 97), "setns": (308, 268)},
+    **{"bpf": (321, 280), "io_uring_setup": (425, 425)},
 }
 """System calls (x86_64, aarch64) for network, and for other programs and processes."""
 ALLOW, KILL, REFUSE = 0x7FFF0000, 0x80000000, 0x50000 | EPERM

@@ -7,6 +7,7 @@ the joint's.
 
 from __future__ import annotations
 
+import shutil
 import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -21,7 +22,6 @@ from lipcore.data.samples import Array
 from service.contract.media_types import SUFFIXES
 from service.datasets.formats.table import Table, block_rows, clean_names, first_line, unreadable
 from service.datasets.formats.zips import (
-    COPY_BYTES,
     ERRORS,
     add_member,
     check_unpacked_size,
@@ -193,8 +193,7 @@ def _unpacked(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> dic
         files[member.filename] = folder / f"{index}.txt"
         try:
             with archive.open(member) as source, files[member.filename].open("xb") as target:
-                while piece := source.read(COPY_BYTES):
-                    target.write(piece)
+                shutil.copyfileobj(source, target)
         except ERRORS as error:
             raise unreadable(member.filename, first_line(error), "a member that can be unpacked") from None
     return files

@@ -78,10 +78,8 @@ def _named(value: Any) -> Any:
 
 
 def _ros_decoder(topic: Topic) -> Decoder:
-    store, name = (
-        get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE),
-        normalize_msgtype(topic.type),
-    )
+    name = normalize_msgtype(topic.type)
+    store = get_typestore(Stores.ROS1_NOETIC if topic.encoding == "ros1" else Stores.ROS2_HUMBLE)
     text = topic.definition.decode(errors="replace").strip()
     if topic.language.endswith("idl"):
         types = get_types_from_idl(text)
