@@ -109,44 +109,78 @@ def describe_alternatives(probabilities: Sequence[float], motion: str, differenc
     )
 
 
-NO_SIGNAL = "the held-out torque is not larger than its noise, so the error cannot be judged"
+NOTHING_HELD_OUT = "No samples were held out of its training, so its errors are unknown."
+HOLD_OUT = "Evaluate it on another recording, or train with a held-out part."
+JUDGED_ON_TRAINING = "It was trained on these samples, so its errors on other motion are unknown."
+EVALUATE_OTHER = "Evaluate its held-out part or another recording."
+NO_SIGNAL = "The torque of these samples is not larger than its noise, so the errors say nothing."
+RECORD_FASTER = "Record faster and wider motion."
+UNKNOWN_RANGE = "Its errors outside the recorded range are unknown."
+CHECK_TORQUE = "Check sign, unit and order of the torque, then record more varied motion and train again."
+RECORD_VARIED = "Record more varied motion and train again."
+RECORD_MORE = "Record more motion of these joints and train again."
+RECORD_LONGER = "Record longer and train again."
+STAY_INSIDE = "Stay inside the recorded range, or record wider and faster motion."
+NOTHING_TO_DO = "No action is needed."
 
 
-def describe_error_against(joints: str) -> str:
+def describe_large_error(joints: str) -> str:
     """Return that a model is no better than the mean torque on some joints."""
-    return f"the error is not below that of the mean torque: {joints}"
+    return f"The errors are no smaller than with the mean torque: {joints}."
 
 
-def describe_error_unknown(joints: str) -> str:
-    """Return that it is unknown whether a model is better than the mean torque on some joints."""
-    return f"too few samples are held out to compare the error with that of the mean torque: {joints}"
+def describe_joint_error(rmse: float, mean: float, unit: str) -> str:
+    """Return the error of one joint, and that of its mean torque."""
+    return f"{rmse:.2g} {unit} RMSE (mean torque: {mean:.2g} {unit})"
 
 
-def describe_error(share: float) -> str:
-    """Return the error of an accepted model. share: of the variance of the torque."""
-    return f"the error is at most {share:.2g} of the torque's variance"
-
-
-def describe_joint_error(share: float, samples: float) -> str:
-    """Return the error of one joint. samples: effective ones."""
-    return f"{share:.2g} of the variance ({samples:.0f} effective samples)"
-
-
-def describe_coverage_against(least: float, joints: str) -> str:
+def describe_narrow(joints: str) -> str:
     """Return that intervals are too narrow on some joints."""
-    return f"coverage of the 95 % intervals is below {100 * least:.0f} %: {joints}"
+    return f"The 95 % intervals are too narrow: {joints}."
 
 
-def describe_coverage(least: float) -> str:
-    """Return the coverage of an accepted model."""
-    return f"coverage of the 95 % intervals is at least {100 * least:.0f} % on every joint, within sampling error"
+def describe_joint_coverage(share: float, low: float, high: float, samples: float) -> str:
+    """Return the coverage of one joint. low, high: its confidence interval; samples: effective ones."""
+    ci = f"95 % CI {100 * low:.0f}–{100 * high:.0f} %"
+    return f"{100 * share:.0f} % inside ({ci}, {samples:.0f} effective samples)"
 
 
-def describe_width(joints: str) -> str:
-    """Return that intervals are wider than errors need. joints: with how many times."""
-    return f"the 95 % intervals are wider than the errors need: {joints}"
+def describe_wide(joints: str) -> str:
+    """Return that intervals are no narrower than without a model on some joints."""
+    return f"The 95 % intervals are no narrower than those of the mean torque: {joints}."
 
 
-def describe_joint_coverage(share: float, high: float, samples: float) -> str:
-    """Return the coverage of one joint. high: upper end of its confidence interval; samples: effective ones."""
-    return f"{100 * share:.0f} % (at most {100 * high:.0f} %, {samples:.0f} effective samples)"
+def describe_joint_width(width: float, mean: float, unit: str) -> str:
+    """Return the width of the intervals of one joint, and of its mean torque."""
+    return f"{width:.2g} {unit} wide (mean torque: {mean:.2g} {unit})"
+
+
+def describe_few_samples(joints: str) -> str:
+    """Return that too few samples are there to compare the error with that of the mean torque."""
+    return f"Too few effective samples to judge the errors: {joints}."
+
+
+def describe_repeated(share: float) -> str:
+    """Return that samples repeat the training motion."""
+    return f"The errors are known only on repeated motion: {100 * share:.0f} % of the samples repeat the training."
+
+
+def describe_few_outside(share: float) -> str:
+    """Return that too few samples are outside the training range."""
+    return f"Its errors outside the recorded range are unknown: {100 * share:.0f} % of the samples were outside it."
+
+
+def describe_worse_outside(joints: str) -> str:
+    """Return that a model is wrong outside the training range on some joints."""
+    return f"Outside the recorded range its errors or intervals are wrong: {joints}."
+
+
+def describe_best(share: float | None, coverage: float) -> str:
+    """Return the largest error of the joints, as a share of the torque range, and the smallest coverage."""
+    error = "" if share is None else f"RMSE is at most {100 * share:.2g} % of the torque range and "
+    return f"{error}coverage at least {100 * coverage:.0f} % on every joint"
+
+
+def describe_usable(best: str) -> str:
+    """Return why a model is usable. best: its figures."""
+    return f"{best[0].upper()}{best[1:]}, inside and outside the recorded range."

@@ -14,6 +14,7 @@ from lipserve.address import DEFAULT_URL
 from lipserve.call import given
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, out, print_json, print_warnings
+from service.cli.models import print_verdict
 from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
 from service.foundation.text import counted
 
@@ -131,9 +132,7 @@ def evaluate(
     if as_json:
         print_json(answer)
         return
-    from service.cli.tables import evaluation_table  # noqa: PLC0415 - slow import, not needed for help
-
-    out.print(evaluation_table(answer))
+    print_verdict(answer.title, answer.verdict)
     print_warnings(answer.warnings)
 
 

@@ -15,7 +15,7 @@ from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, robot_of, urdf_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json, print_warnings
-from service.cli.models import print_held_out, print_promotion, print_selection
+from service.cli.models import print_judged, print_selection
 from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Promotion, Url, alone, group, names, pairs, value
 from service.foundation.text import percent
 
@@ -42,14 +42,14 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
     if not jobs:
         echo("no jobs yet: `lipserve train FILE --model NAME` queues one")
         return
-    from service.cli.tables import quality_cells  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli.tables import verdict_cells  # noqa: PLC0415 - takes long to import; help needs none
 
     figures = ("held-out nMSE", "coverage")
     table = Table(Column("id", no_wrap=True), "model", "estimator", "state", "done", "version", *figures, "queued")
     for job in jobs:
         version = "-" if job.version is None else str(job.version)
         at = job.created_at[:16].replace("T", " ")
-        cells = (job.estimator, job.state, percent(job.progress.fraction), version, *quality_cells(job.quality), at)
+        cells = (job.estimator, job.state, percent(job.progress.fraction), version, *verdict_cells(job.verdict), at)
         table.add_row(job.id, escape(job.model), *cells)
     out.print(table)
 
@@ -235,12 +235,11 @@ def train(
     echo(f"{model} version {job.version} trained: {'candidate, not serving' if waits else 'now serving'}")
     if made.selection is not None:
         print_selection(made.selection)
-    if made.lineage.get("holdout") is not None:
-        print_held_out(made)
-    print_promotion(made)
+    print_judged(made)
     print_warnings(made.warnings)
     if waits:
-        note(f"`lipserve models promote {model} {job.version}` makes it the serving version")
+        forced = "" if made.verdict.serves else " --override"
+        note(f"`lipserve models promote {model} {job.version}{forced}` makes it the serving version")
 
 
 def _holdout(share: float | None, kind: str | None, only: bool) -> dict[str, Any] | Literal[False] | None:

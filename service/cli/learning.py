@@ -57,15 +57,14 @@ def show(model: Model, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
 
 def _print_quality(quality: Quality) -> None:
     """Print prediction errors of rows before they were learnt, over the longest window that has rows."""
-    from service.cli.tables import figures_table  # noqa: PLC0415 - slow import, not needed for help
+    from service.cli.tables import quality_table  # noqa: PLC0415 - slow import, not needed for help
 
     seen = max(quality.windows, key=lambda each: (each.rows > 0, each.seconds))
     if not seen.rows:
         echo(f"no rows received in the last {seen.seconds:.0f} s")
         return
     title = f"prediction of {counted(seen.rows, 'row')} of the last {seen.seconds:.0f} s, before learning from them"
-    figures = {"nmse": seen.nmse, "rmse": seen.rmse, "coverage": seen.coverage, "nlpd": seen.nlpd}
-    out.print(figures_table(title, quality.joint_names, figures))
+    out.print(quality_table(title, quality.joint_names, seen))
 
 
 @app.command("set")

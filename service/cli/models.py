@@ -16,17 +16,19 @@ from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
 from service.cli.options import Alias, Data, Json, Limit, Model, Promotion, Url, Version, Yes, confirm, group
+from service.cli.wording import in_shell
 from service.foundation.text import counted
 
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
-    from lipserve.records.models import Selection
+    from lipserve.records.models import Selection, Verdict
     from lipserve.results.arm import Version as VersionRecord
     from service.contract.states import PromotionOption
 
 app = group("List, show, promote, roll back, alias, compare, export, import and delete models.")
 SERVING = "serving"
 Which = Annotated[str, typer.Argument(help="Version number or alias.", autocompletion=connecting.versions)]
+Override = Annotated[bool, typer.Option("--override", help="Promote a version that is not usable by its verdict.")]
 AliasName = Annotated[str, typer.Option("--alias", help="Alias to move.", autocompletion=connecting.aliases)]
 
 
@@ -41,16 +43,18 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
     if not models:
         echo("no models yet: `lipserve train FILE --model NAME` makes one")
         return
-    from service.cli.tables import quality_cells  # noqa: PLC0415 - slow import, not needed for help
+    from service.cli.tables import verdict_cells  # noqa: PLC0415 - slow import, not needed for help
 
-    table = Table("model", "serving", "held-out nMSE", "coverage", "versions", "estimator", "aliases", "created")
+    table = Table(
+        "model", "serving", "verdict", "max error of range", "coverage", "versions", "estimator", "aliases", "created"
+    )
     for model in models:
         serving = next((each for each in model.versions if each.version == model.serving_version), None)
         aliases = ", ".join(f"{name} → {at}" for name, at in model.aliases.items()) or "-"
         table.add_row(
             escape(model.name),
             str(model.serving_version or "none"),
-            *quality_cells(None if serving is None else serving.quality),
+            *verdict_cells(None if serving is None else serving.verdict),
             str(len(model.versions)),
             "-" if serving is None else serving.estimator,
             escape(aliases),
@@ -63,7 +67,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Print a model with its versions, and details of one version (default: the serving version)."""
     from lipserve import ApiError  # noqa: PLC0415 - slow import, not needed for help
-    from service.cli.tables import quality_cells  # noqa: PLC0415 - as above
+    from service.cli.tables import verdict_cells  # noqa: PLC0415 - as above
 
     with connected(url) as client:
         record = client.model(model)
@@ -81,31 +85,33 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
         paused = "; learning is paused until you decide" if learning.held is not None else ""
         learnt = f"revision {learning.published} of {learning.revision} serving"
         echo(f"  online learning: {learnt if learning.revision else 'nothing learnt yet'}{paused}")
-    table = Table("version", "held-out nMSE", "coverage", "check passed", "estimator", "created", "aliases")
+    table = Table("version", "verdict", "max error of range", "coverage", "estimator", "created", "aliases")
     for each in record.versions:
         named = [name for name, at in record.aliases.items() if at == each.version]
         named = [SERVING, *named] if each.version == record.serving_version else named
         at = each.created_at[:16].replace("T", " ")
-        passed = None if each.promotion is None else each.promotion.passed
-        check = {True: "yes", False: "no", None: "not checked"}[passed]
-        table.add_row(
-            str(each.version), *quality_cells(each.quality), check, each.estimator, at, escape(", ".join(named)) or "-"
-        )
+        cells = verdict_cells(each.verdict)
+        table.add_row(str(each.version), *cells, each.estimator, at, escape(", ".join(named)) or "-")
     out.print(table)
     _print_version(detail)
 
 
 @app.command()
 def promote(
-    model: Model, version: Which, alias: AliasName = SERVING, url: Url = DEFAULT_URL, as_json: Json = False
+    model: Model,
+    version: Which,
+    alias: AliasName = SERVING,
+    override: Override = False,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
 ) -> None:
-    """Make a version the serving version; with --alias, point that alias to it instead."""
+    """Make a version the serving version; with --alias, point that alias to it instead.
+
+    A version that is not usable by its verdict needs --override.
+    """
     with connected(url) as client:
-        moved = client.set_alias(model, alias, _which(version))
-        check = client.version(model, moved.version).promotion
+        moved = client.set_alias(model, alias, _which(version), override=override)
     _moved(model, moved, as_json)
-    if not as_json and check is not None and not check.passed:
-        print_warnings([f"version {moved.version} did not pass the promotion check: {check.reason}"])
 
 
 @app.command()
@@ -139,6 +145,7 @@ def alias(
         typer.Argument(help="Version to point it to: number or another alias.", autocompletion=connecting.versions),
     ] = None,
     remove: Annotated[bool, typer.Option("--remove", help="Remove the alias. Its version stays.")] = False,
+    override: Override = False,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
@@ -151,7 +158,7 @@ def alias(
             print_result({"removed": name}, as_json, f"alias {name} of {model} removed")
             return
         if version is not None:
-            _moved(model, client.set_alias(model, name, _which(version)), as_json)
+            _moved(model, client.set_alias(model, name, _which(version), override=override), as_json)
             return
         aliases = [each for each in client.aliases(model) if each.alias == name]
     if not aliases:
@@ -309,28 +316,28 @@ def print_selection(selection: Selection) -> None:
         echo("  held-out motion repeats training motion: figures are too optimistic, except at the edge")
 
 
-def print_held_out(version: VersionRecord) -> None:
-    """Print the figures of a version on its held-out part."""
-    from service.cli.tables import figures_table  # noqa: PLC0415 - slow import, not needed for help
+def print_verdict(title: str, verdict: Verdict) -> None:
+    """Print a verdict: figures joint by joint, then its level, why, and what to do."""
+    from service.cli.tables import verdict_table  # noqa: PLC0415 - slow import, not needed for help
 
-    held = version.lineage["holdout"]
-    out.print(figures_table(f"{counted(held['samples'], 'held-out sample')}", version.joint_names, held))
+    if verdict.joints:
+        out.print(verdict_table(title, verdict))
+    echo(f"{verdict.label}: {in_shell(verdict.reason)}")
+    if verdict.level != "usable":
+        echo(f"  {in_shell(verdict.action)}")
+
+
+def print_judged(version: VersionRecord) -> None:
+    """Print the verdict on a version, and why it does not serve although it is usable."""
+    held: dict[str, Any] = version.lineage.get("holdout") or {}
+    print_verdict(counted(held.get("samples", 0), "held-out sample"), version.verdict)
     if held.get("learnt"):
         echo("  Evaluated on held-out rows; the version was then trained on all rows.")
     if (curve := held.get("learning_curve")) is not None:
         echo(f"  {curve['text']}")
-    print_warnings(held.get("warnings", ()))
-
-
-def print_promotion(version: VersionRecord) -> None:
-    """Print whether a version passed the promotion check, and why; nothing for refreshed or shipped versions."""
-    check = version.promotion
-    if check is None:
-        return
-    if check.passed:
-        echo(f"  promotion check passed: {check.reason}")
-    else:
-        print_warnings([check.reason])
+    promotion = version.promotion
+    if promotion is not None and not promotion.answers and version.verdict.serves:
+        print_warnings([promotion.reason])
 
 
 def _print_guarantee(conformal: dict[str, Any]) -> None:
@@ -372,11 +379,7 @@ def _print_version(version: VersionRecord) -> None:
     if version.conformal is not None:
         _print_guarantee(version.conformal)
     print_of_joints(version)
-    if lineage.get("holdout") is not None:
-        print_held_out(version)
-    else:
-        echo("  no data were held out: run `lipserve evaluate` on a recording that was not used for training")
-    print_promotion(version)
+    print_judged(version)
     print_warnings(version.warnings)
     arm = version.arm
     if arm is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +10,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.records.datasets import AgainstRobot, DatasetReport, JointExcitation, JointNoise, Weight
-from lipserve.records.models import HeldOutQuality, Selection
+from lipserve.records.learning import QualityWindow
+from lipserve.records.models import Selection, Verdict
 from lipserve.results.arm import Arm
-from lipserve.results.evaluation import Comparison, Evaluation
+from lipserve.results.evaluation import Comparison
 from lipserve.results.series import Prediction
 from service.foundation.text import counted, percent
 
@@ -37,33 +38,53 @@ def prediction_tables(answer: Prediction) -> list[Table]:
     return [joints, *matrices, *([numbers] if numbers.row_count else [])]
 
 
-FIGURES = ("nmse", "rmse", "coverage", "coverage_low", "coverage_high", "independent", "interval_width", "nlpd")
-"""Figures of each joint."""
-
-
-def evaluation_table(result: Evaluation) -> Table:
-    """Return a table of the figures of an evaluation, one row per joint."""
-    figures = {name: getattr(result, name).tolist() for name in FIGURES}
-    return figures_table(result.title, result.joint_names, figures)
-
-
-def quality_cells(quality: HeldOutQuality | None) -> tuple[str, str]:
-    """Return the joints' mean held-out nMSE and mean coverage as cells of a list."""
-    if quality is None:
-        return NOTHING, NOTHING
-    return _figure(_mean(quality.nmse), ".2e"), _figure(_mean(quality.coverage), ".0%")
-
-
-def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
-    """Return a table of figures, one row per joint; figures that are missing (older imports) show as `-`."""
+def verdict_table(title: str, verdict: Verdict) -> Table:
+    """Return a table of a verdict, one row per joint. Comparisons with unknown values are left out."""
+    joints = verdict.joints
+    optional = {
+        "of rated": [_figure(each.limit_share, ".1%") for each in joints],
+        "serving": [_figure(each.serving_rmse, ".2g") for each in joints],
+    }
+    shown = {head: cells for head, cells in optional.items() if any(cell != "-" for cell in cells)}
     table = Table(
-        "joint", "nMSE", "RMSE N·m", "coverage (95 %)", "95 % CI of coverage", "width N·m", "NLPD nats", title=title
-    )
-    columns = [figures.get(name) or [None] * len(joint_names) for name in FIGURES]
-    for joint, nmse, rmse, coverage, low, high, count, width, nlpd in zip(joint_names, *columns, strict=True):
-        ci = "-" if count is None else f"{percent(low)} to {percent(high)} ({round(count):,} effective)"
-        cells = [_figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), ci]
-        table.add_row(joint, *cells, _figure(width, ".3f"), _figure(nlpd, ".3f"))
+        "joint", "verdict", "RMSE", "of range", *shown, "mean torque", "coverage (95 %)", "95 % CI", "width", "× need",
+        title=title,
+    )  # fmt: skip
+    for at, each in enumerate(joints):
+        ci = (
+            "-"
+            if each.coverage_low is None
+            else f"{percent(each.coverage_low)} to {percent(each.coverage_high or 1.0)}"
+        )
+        table.add_row(
+            each.joint,
+            each.level.replace("_", " "),
+            f"{each.rmse:.2g} {each.unit}",
+            _figure(each.range_share, ".1%"),
+            *(cells[at] for cells in shown.values()),
+            _figure(each.mean_rmse, ".2g"),
+            _figure(each.coverage, ".0%"),
+            ci,
+            _figure(each.interval_width, ".2g"),
+            _figure(each.width_over_need, ".2g"),
+        )
+    return table
+
+
+def verdict_cells(verdict: Verdict | None) -> tuple[str, str, str]:
+    """Return a verdict, the largest error of the joints and their mean coverage as cells of a list."""
+    if verdict is None:
+        return NOTHING, NOTHING, NOTHING
+    shares = [each.range_share for each in verdict.joints if each.range_share is not None]
+    coverage = _mean([each.coverage for each in verdict.joints])
+    return verdict.label, _figure(max(shares, default=None), ".1%"), _figure(coverage, ".0%")
+
+
+def quality_table(title: str, joint_names: Sequence[str], window: QualityWindow) -> Table:
+    """Return a table of the prediction quality of a window, one row per joint."""
+    table = Table("joint", "nMSE", "RMSE N·m", "coverage (95 %)", "NLPD nats", title=title)
+    for joint, *figures in zip(joint_names, window.nmse, window.rmse, window.coverage, window.nlpd, strict=True):
+        table.add_row(joint, *map(_figure, figures, (".2e", ".4f", ".1%", ".3f")))
     return table
 
 

@@ -15,7 +15,12 @@ FLAGS = {
     **{name: f"--{name}" for name in ("trim", "joints", "form", "model", "estimator", "base", "promotion")},
     **{"drop_joints": "--drop", "columns": "--column", "units": "--unit", "options": "--option"},
     **{"column_names": "--columns", "dt": "--dt", "poses": "--poses", "scale": "--scale", "xacro": "--xacro"},
-    **{"holdout.share": "--hold-out", "holdout.kind": "--hold-out-by", "holdout.only": "--hold-out-only"},
+    **{
+        "holdout.share": "--hold-out",
+        "holdout.kind": "--hold-out-by",
+        "holdout.only": "--hold-out-only",
+        "override": "--override",
+    },
 }
 """Command line options by API field."""
 QUANTITIES_BY_NAME = ("columns", "units", "options")

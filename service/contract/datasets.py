@@ -54,6 +54,7 @@ class JointLimits(BaseModel):
     joint: str
     range_used: Share | None = Field(description="Largest less smallest position, as a share of the joint's range")
     speed_used: Share | None = Field(description="Largest speed divided by the speed limit")
+    torque_limit: float | None = Field(None, description="Rated torque of the actuator, N·m")
     torque_used: Share | None = Field(description="Largest torque divided by the torque limit")
     beyond_range: Share | None = Field(description="Share of samples beyond the position limits")
     beyond_speed: Share | None = Field(description="Share of samples beyond the speed limit")

@@ -108,6 +108,14 @@ class Stretches(BaseModel):
     )
 
 
+class OutsideRange(BaseModel):
+    """Quality on the samples outside the training range, per joint; null without such samples."""
+
+    share: float = Field(ge=0, le=1, description="Share of the samples")
+    squared: list[float | None] = Field(description="Mean squared error, (N·m)²")
+    coverage: list[float | None] = Field(description="Share of measurements inside the 95 % interval")
+
+
 class Evaluation(BaseModel):
     """Prediction quality on a data set, or on part of it, per joint."""
 
@@ -129,6 +137,12 @@ class Evaluation(BaseModel):
     coverage_low: list[float] = Field(description="Lower end of the 95 % confidence interval of the coverage")
     coverage_high: list[float] = Field(
         description="Upper end of this confidence interval. If it is below 0.9, intervals are too narrow"
+    )
+    torque_range: list[float] | None = Field(
+        None, description="Max less min of the measured torque, N·m; null for versions of earlier releases"
+    )
+    outside: OutsideRange | None = Field(
+        None, description="Quality outside the training range; null for versions of earlier releases"
     )
     repeats_training: float | None = Field(
         description="Share of samples with motion (position, velocity and acceleration) that repeats training motion, "

@@ -9,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.estimators.options import MAX_SEARCH_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, TORCH_ESTIMATORS, JointType
 from service.contract.holdout import Holdout
-from service.contract.models import VERSION, HeldOutQuality, ModelName
+from service.contract.models import VERSION, ModelName
 from service.contract.states import JobState, PromotionOption
+from service.contract.verdict import Verdict
 from service.foundation.fields import MAX_NAME_CHARS, MAX_NAMES
 
 MAX_OPTIONS = {"hyperparameter_samples": 500, "posterior_samples": 1000, "max_inducing_outputs": 4000}
@@ -206,9 +207,7 @@ class Job(BaseModel):
     progress: JobProgress
     attempts: int = Field(description="Number of starts; more than one after an interruption")
     version: int | None = Field(description="Version that the job made; null unless it succeeded")
-    quality: HeldOutQuality | None = Field(
-        None, description="Quality of that version on the held-out part; null if nothing was held out"
-    )
+    verdict: Verdict | None = Field(None, description="Verdict on that version; null without one")
     error: JobError | None
     created_at: str
     started_at: str | None

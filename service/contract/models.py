@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from lipcore.model.acceptance import Acceptance
 from lipcore.vocabulary import JointType, TorqueConvention
 from service.contract.states import PromotionOption
+from service.contract.verdict import Verdict
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
@@ -62,33 +62,18 @@ class Selection(BaseModel):
 
 
 class Promotion(BaseModel):
-    """Whether a new version became the serving version, and why. The held-out part of its training decides."""
+    """Whether a new version became the serving version, and why."""
 
     answers: bool = Field(description="Whether it started to serve after training; else it got the alias `candidate`")
-    passed: bool | None = Field(
-        description="Whether its error is below that of the mean torque on every joint, coverage is at least 90 %, and "
-        "it is not worse than the serving version; null if that cannot be determined"
-    )
     serving: int | None = Field(description="Serving version until then; null if there was none")
     reason: str
 
     @classmethod
-    def of(cls, found: Acceptance, serving: int | None, option: PromotionOption = "ask") -> Promotion:
-        """Decide whether a version serves: if it has passed the check, or if its owner always promotes."""
-        passed, reason = found.passed, found.reason
-        if not passed and option == "always":
-            reason += "; it serves, because `promotion` is always"
-        return cls(answers=passed is True or option == "always", passed=passed, serving=serving, reason=reason)
-
-
-class HeldOutQuality(BaseModel):
-    """Quality of the evaluated fit of a version on the held-out part, per joint; null if torque is constant."""
-
-    samples: int = Field(description="Number of held-out samples")
-    nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
-    coverage: list[float | None] = Field(description="Share of measurements inside the 95 % interval")
-    coverage_low: list[float] = Field(description="Lower end of the confidence interval of the coverage")
-    coverage_high: list[float] = Field(description="Upper end of this confidence interval")
+    def of(cls, serves: bool, reason: str, serving: int | None, option: PromotionOption = "ask") -> Promotion:
+        """Decide whether a version serves: if it may, or if its owner always promotes."""
+        if not serves and option == "always":
+            reason += " It serves, because `promotion` is always."
+        return cls(answers=serves or option == "always", serving=serving, reason=reason)
 
 
 class Version(BaseModel):
@@ -130,6 +115,7 @@ class Version(BaseModel):
         description="Data sets with their hashes, time and `software` of the training, and `training_metrics`; also "
         "the version it started from (`base`) and the origin of an imported version (`imported`)"
     )
+    verdict: Verdict
     promotion: Promotion | None = Field(
         None, description="Whether it became the serving version; null for a refreshed or shipped version"
     )
@@ -148,9 +134,7 @@ class VersionSummary(BaseModel):
     version: int
     created_at: str
     estimator: str
-    quality: HeldOutQuality | None = Field(
-        None, description="Quality on the held-out part of its training; null if nothing was held out"
-    )
+    verdict: Verdict
     promotion: Promotion | None = Field(
         None, description="Whether it became the serving version, and why; null for a refreshed or shipped version"
     )
@@ -185,6 +169,7 @@ class AliasRequest(BaseModel):
 
     version: VersionNumber | None = Field(None, description="A version of the model")
     alias: AliasName | None = Field(None, description="Another alias of the model, instead of a version")
+    override: bool = Field(False, description="Move the alias whatever the verdict on the version")
 
 
 class AliasMove(BaseModel):

@@ -8,8 +8,8 @@ from pydantic import BaseModel, Field
 
 from lipcore.vocabulary import JointType
 from service.contract.learning import Alarm, Nullable
-from service.contract.models import HeldOutQuality
 from service.contract.payload import LivePayload
+from service.contract.verdict import Verdict
 
 Three = list[float]
 
@@ -66,9 +66,7 @@ class ModelOverview(BaseModel):
     created_at: str = Field(description="Creation time of the version")
     joint_names: list[str]
     joint_types: list[JointType]
-    quality: HeldOutQuality | None = Field(
-        description="Quality on the held-out part of its training; null if nothing was held out"
-    )
+    verdict: Verdict
     candidate: int | None = Field(description="Version under the alias `candidate`")
     arm: ArmSketch | None = Field(description="Null if the estimator has no arm geometry")
     position: list[float] = Field(

@@ -20,6 +20,7 @@ from service.contract.holdout import Evaluation
 from service.contract.models import AliasName, VersionNumber
 from service.contract.payload import Payload
 from service.contract.states import Outcome
+from service.contract.verdict import Verdict
 from service.foundation.errors import invalid_request
 from service.foundation.fields import MAX_NAME_CHARS, check_unique, list_of_numbers, rows_of_numbers
 
@@ -227,6 +228,7 @@ class EvaluateResponse(Evaluation):
         description="Whether the figures are of the evaluated fit, which was trained without these samples before the "
         "version was trained on all"
     )
+    verdict: Verdict = Field(description="Verdict on the version by these figures")
 
 
 TraceComponent = Literal["inertial", "coriolis", "gravity", "friction"]
@@ -325,6 +327,7 @@ class VersionFigures(BaseModel):
     in_training: bool = Field(
         description="Whether the version was trained on this data set, so that its figures are too good"
     )
+    verdict: Verdict = Field(description="Verdict on the version by these figures")
 
 
 class Differences(BaseModel):

@@ -12,7 +12,7 @@ from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
 from service.inference import texts
-from service.inference.evaluating import read_dataset
+from service.inference.evaluating import judge, read_dataset
 from service.models.evaluation import joint_figures
 from service.models.loaded import LoadedModels, ServedModel
 
@@ -28,6 +28,7 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
     compared = metrics.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
     in_training = [each.has_learnt_from(recorded.id, recorded.sha256) for each in versions]
+    judged = [judge(loaded, recorded, *each) for each in zip(versions, answers, in_training, strict=True)]
     return schema.CompareResponse(
         model=model,
         dataset=recorded.id,
@@ -41,8 +42,9 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
                 revision=each.revision,
                 **joint_figures(evaluate(recorded.used.tau, *answer)),
                 in_training=trained,
+                verdict=verdict,
             )
-            for each, answer, trained in zip(versions, answers, in_training, strict=True)
+            for each, answer, trained, verdict in zip(versions, answers, in_training, judged, strict=True)
         ],
         differences=schema.JointDifferences(
             **{

@@ -10,17 +10,20 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
+from lipcore.model.verdict import JudgedOn
 from lipcore.profiles import profile, recognise
 from service.contract import predictions as schema
 from service.contract.holdout import Evaluation, HoldoutLineage
+from service.contract.verdict import Verdict
 from service.datasets import store
 from service.foundation.errors import DamagedDataError, invalid_request
 from service.inference import texts
 from service.inference.predicting import MAX_COMPONENT_BATCH, check_offered
-from service.models import registry
+from service.models import registry, verdicts
 from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
 from service.models.loaded import LoadedModels, ServedModel
 from service.storage import sample_file
@@ -68,8 +71,7 @@ def read_held_out(loaded: LoadedModels, dataset: str, served: ServedModel) -> Ev
 
 def _split_of(loaded: LoadedModels, row: DatasetRow, served: ServedModel) -> SetSplit:
     """Return how a version split a data set; raise CannotHoldOutError if nothing of it was held out."""
-    version = registry.find(loaded.database, served.name, served.version)
-    split = holding_out.find_earlier_split(row, version.manifest["lineage"])
+    split = holding_out.find_earlier_split(row, _manifest(loaded, served)["lineage"])
     if split is None:
         raise CannotHoldOutError(f"version {served.version} has no held-out rows of data set {row.id}")
     return split
@@ -127,6 +129,8 @@ def evaluate(
     in_training, revision = False, 0
     if judged is None:
         in_training, revision = _in_training(loaded, row, request.part, served), served.revision
+    fields = _compared(loaded, request, served, in_training) if judged is None else judged.model_dump()
+    origin: JudgedOn = "training" if in_training else "held_out" if request.part == "held_out" else "recording"
     return schema.EvaluateResponse(
         model=served.name,
         version=served.version,
@@ -136,8 +140,20 @@ def evaluate(
         joint_names=list(served.model.joint_names),
         in_training=in_training,
         judged=judged is not None,
-        **(_compared(loaded, request, served, in_training) if judged is None else judged.model_dump()),
+        verdict=verdicts.of_evaluation(fields, _manifest(loaded, served), origin, row),
+        **fields,
     )
+
+
+def judge(
+    loaded: LoadedModels, recorded: EvaluationData, served: ServedModel, answer: TorqueDistribution, in_training: bool
+) -> Verdict:
+    """Return the verdict on a version by its answer at the samples of a data set."""
+    used = recorded.used
+    figures = evaluation(used, answer, served.model.training_range)
+    figures |= _repeats(loaded, served, used, in_training)
+    row, manifest = store.find(loaded.database, recorded.id), _manifest(loaded, served)
+    return verdicts.of_evaluation(figures, manifest, "training" if in_training else "recording", row)
 
 
 def _compared(
@@ -148,7 +164,8 @@ def _compared(
     used = recorded.used
     answer = served.model.predict_along(used)
     repeats = _repeats(loaded, served, used, in_training)
-    return {"samples": recorded.samples, **evaluation(used, answer.interval), **repeats}
+    figures = evaluation(used, answer.interval, served.model.training_range)
+    return {"samples": recorded.samples, **figures, **repeats}
 
 
 def _judged(loaded: LoadedModels, row: DatasetRow, served: ServedModel) -> Evaluation | None:
@@ -169,17 +186,19 @@ def _in_training(loaded: LoadedModels, row: DatasetRow, part: schema.Part, serve
 
 def _holdout_of(loaded: LoadedModels, served: ServedModel) -> dict[str, Any]:
     """Return the held-out record of a version's lineage; empty if nothing was held out."""
-    version = registry.find(loaded.database, served.name, served.version)
-    return version.manifest["lineage"].get("holdout") or {}
+    return _manifest(loaded, served)["lineage"].get("holdout") or {}
+
+
+def _manifest(loaded: LoadedModels, served: ServedModel) -> dict[str, Any]:
+    return registry.find(loaded.database, served.name, served.version).manifest
 
 
 def _repeats(loaded: LoadedModels, served: ServedModel, used: Samples, in_training: bool) -> dict[str, Any]:
     """Return how much of the samples repeats the training motion, unless the version was trained on them."""
     if in_training:
         return repeating.find_repetition([], used, served.model.joint_types)
-    version = registry.find(loaded.database, served.name, served.version)
     try:
-        training = repeating.read_training_parts(loaded.database, loaded.files, version.manifest["lineage"])
+        training = repeating.read_training_parts(loaded.database, loaded.files, _manifest(loaded, served)["lineage"])
         return repeating.find_repetition(training, used, served.model.joint_types)
     except (CannotHoldOutError, DamagedDataError) as error:  # the figures are valid without the training data
         return {**repeating.find_repetition([], used, ()), "warnings": [texts.describe_unknown_repetition(error)]}

@@ -8,9 +8,9 @@ from sqlalchemy.orm import Session
 from lipcore.estimators.base import RobotKind
 from service.contract.models import Alias, AliasList, AliasMove, AliasRequest
 from service.foundation.errors import ConflictError, invalid_request, not_found
-from service.models import registry
+from service.models import registry, texts, verdicts
 from service.models.loaded import LoadedModels
-from service.models.registry import SERVING
+from service.models.registry import CANDIDATE, SERVING
 from service.storage.database import AliasMoveRow, AliasRow, ServingRow, VersionRow, now
 
 
@@ -28,14 +28,24 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
 
     The version is loaded and warm before the alias moves. Queries follow by one assignment; queries in flight keep
     their version. Raise InvalidRequestError unless exactly one of version and alias is given, NotFoundError,
-    UnreadableVersionError, and ConflictError beyond MAX_ALIASES or for a version of another robot. Blocking: use it
-    in a thread.
+    UnreadableVersionError, and ConflictError beyond MAX_ALIASES, for a version of another robot, or for one that is not
+    usable by its verdict, unless the request overrides that. Blocking: use it in a thread.
     """
     if (request.version is None) == (request.alias is None):
         given = "neither" if request.version is None else "both"
         message = f"Expected either `version` or `alias`, got {given}."
         raise invalid_request("version or alias", given, "exactly one of the two", message)
-    return _move(loaded, model, alias, loaded.get(model, request.version, request.alias).version)
+    version = loaded.get(model, request.version, request.alias).version
+    if alias != CANDIDATE and not request.override and loaded.storage.settings.promotion != "always":
+        _check_verdict(loaded, model, version)
+    return _move(loaded, model, alias, version)
+
+
+def _check_verdict(loaded: LoadedModels, model: str, version: int) -> None:
+    """Raise ConflictError unless the verdict on a version is usable."""
+    verdict = verdicts.of_version(registry.find(loaded.database, model, version).manifest)
+    if not verdict.serves:
+        raise ConflictError(texts.describe_refusal(version, texts.describe_verdict(verdict.label, verdict.reason)))
 
 
 def rollback(loaded: LoadedModels, model: str, alias: str) -> Alias:

@@ -15,7 +15,6 @@ from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError, read_manifest_bytes
 from lipcore.files.probing import probe
 from lipcore.files.strict_json import StrictJsonError, check_texts
-from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
 from service.contract.jobs import MAX_OPTIONS
@@ -23,10 +22,9 @@ from service.contract.models import Promotion, Version
 from service.contract.states import PromotionOption
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
-from service.models import archive_reading, registry
+from service.models import archive_reading, registry, texts, verdicts
 from service.models.archive_lineage import Lineage
 from service.models.archive_reading import invalid_member, invalid_model, limits_of
-from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
 from service.runtime import cage
 from service.storage.database import now
@@ -77,21 +75,15 @@ def _publish(
     """Add the version; return its number and whether it serves."""
     with loaded.database.transaction() as session:
         registry.check_robot(session, model, RobotKind.of_manifest(manifest))
-        first = not registry.has_model(session, model)
-        other = Acceptance(unknown=("not judged, because it was imported into a model with other versions",))
-        judged = Promotion.of(_accepted(manifest) if first else other, registry.serving_version(session, model), option)
+        serves, reason = False, "It was imported into a model with other versions. Compare them on a recording first."
+        if not registry.has_model(session, model):
+            verdict = verdicts.of_version(manifest)
+            serves, reason = verdict.serves, texts.describe_verdict(verdict.label, verdict.reason)
+        judged = Promotion.of(serves, reason, registry.serving_version(session, model), option)
         version = registry.publish(
             session, model, folder, manifest, None, candidate=not judged.answers, promotion=judged
         )
     return version, judged.answers
-
-
-def _accepted(manifest: Mapping[str, Any]) -> Acceptance:
-    """Judge a version by the held-out figures in its lineage."""
-    try:
-        return accept(held_out_figures(tuple(manifest["joint_names"]), manifest["lineage"]["holdout"]))
-    except (KeyError, TypeError, ValueError):
-        return Acceptance(unknown=("not judged, because its archive has no figures of held-out rows",))
 
 
 def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:

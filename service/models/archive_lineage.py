@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.files.entries import MAX_VALUE
-from service.contract.holdout import HoldoutLineage
+from service.contract.holdout import HoldoutLineage, OutsideRange
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[float, Field(ge=0, le=MAX_VALUE)]
@@ -38,7 +38,27 @@ class Figures(Strict):
     independent: list[Size | None] = []
 
 
-class HeldOut(HoldoutLineage, Figures):
+class ServingErrors(BaseModel):
+    """Errors of the version that served before, on the same rows."""
+
+    model_config = ConfigDict(strict=True)
+
+    version: Count
+    rmse: list[Size]
+
+
+class JudgedFigures(Figures):
+    """Figures that a verdict needs."""
+
+    torque_noise: list[Size] | None = None
+    torque_range: list[Size] | None = None
+    torque_limit: list[Size | None] | None = None
+    outside: OutsideRange | None = None
+    repeats_training: Share | None = None
+    serving: ServingErrors | None = None
+
+
+class HeldOut(HoldoutLineage, JudgedFigures):
     """Quality of predictions on held-out rows."""
 
 
@@ -60,6 +80,7 @@ class LineageDataset(BaseModel):
     name: str = Field("", max_length=1000)
     sha256: str = Field("", max_length=64)
     rows: Count = 0
+    faults: list[Annotated[str, Field(max_length=2000)]] = Field([], max_length=100)
 
 
 class Lineage(BaseModel):
@@ -71,6 +92,7 @@ class Lineage(BaseModel):
     imported: list[dict[str, Any]] = Field([], max_length=1000)
     learnt: dict[str, Any] | None = None
     holdout: HeldOut | None = None
+    judged: JudgedFigures | None = None
     training_metrics: Figures | None = None
     training_process: ProcessFields | None = None
     trained_at: str | None = Field(None, max_length=40)

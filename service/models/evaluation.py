@@ -11,6 +11,8 @@ from lipcore.data import metrics
 from lipcore.data.coverage import CoverageInterval, coverage_interval
 from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics, TorqueDistribution
 from lipcore.data.samples import Array, Samples
+from lipcore.model.torque_model import TrainingRange
+from lipcore.model.verdict import is_outside
 from service.contract.holdout import Interval, Reliability, Stretches
 from service.foundation.fields import finite
 
@@ -43,8 +45,21 @@ def stretches(samples: Samples, mean: Array) -> Stretches:
     )
 
 
-def evaluation(samples: Samples, answer: TorqueDistribution) -> dict[str, Any]:
-    """Return the fields of `Evaluation` for an answer (mean and deviations) at samples."""
+def range_figures(samples: Samples, answer: TorqueDistribution, known: TrainingRange) -> dict[str, Any]:
+    """Return the range of the torque of samples, and the quality of an answer outside the training range."""
+    outside = is_outside(samples.motion(), known)
+    squared = ((samples.tau - answer.mean) ** 2)[outside]
+    figures = {"squared": squared, "coverage": answer.contains(samples.tau)[outside]}
+    means = {name: values.mean(axis=0).tolist() if len(values) else None for name, values in figures.items()}
+    unknown = [None] * samples.n_joints
+    return {
+        "torque_range": np.ptp(samples.tau, axis=0).tolist(),
+        "outside": {"share": float(outside.mean()), **{name: each or unknown for name, each in means.items()}},
+    }
+
+
+def evaluation(samples: Samples, answer: TorqueDistribution, known: TrainingRange) -> dict[str, Any]:
+    """Return the fields of `Evaluation` for an answer at samples. known: training range of the model."""
     found = metrics.evaluate(samples.tau, *answer)
     return {
         "samples_used": len(samples),
@@ -57,6 +72,7 @@ def evaluation(samples: Samples, answer: TorqueDistribution) -> dict[str, Any]:
         ],
         "reliability": Reliability(nominal=list(RELIABILITY_LEVELS), observed=found.reliability.T.tolist()),
         "stretches": stretches(samples, answer.mean),
+        **range_figures(samples, answer, known),
     }
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,11 +18,11 @@ from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
-from lipcore.model.acceptance import HeldOutFigures
 from lipcore.model.torque_model import TorqueModel
 from service import __version__
 from service.foundation.fields import finite
 from service.models.evaluation import coverage_fields
+from service.models.verdicts import find_faults
 from service.storage.database import DatasetRow
 
 MAX_METRIC_SAMPLES = 500
@@ -57,6 +56,7 @@ def describe_datasets(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
             "sha256": row.sha256,
             "rows": row.rows,
             **{name: row.report[name] for name in prepared if row.report.get(name) is not None},
+            **({"faults": faults} if (faults := find_faults(row)) else {}),
         }
         for row in rows
     ]
@@ -83,21 +83,6 @@ def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[st
     per_joint = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
     width = {"interval_width": compared.width.tolist()}
     return {"samples": len(used), "of": of, **per_joint, **width, **coverage_fields(coverage_interval(used, answer))}
-
-
-def held_out_figures(joint_names: tuple[str, ...], holdout: Mapping[str, Any]) -> HeldOutFigures:
-    """Return the held-out figures of a fit from a lineage.
-
-    Raise KeyError, TypeError or ValueError if they are missing or malformed.
-    """
-    found = {
-        each.name: np.array(holdout[each.name], np.float64)
-        for each in fields(HeldOutFigures)
-        if each.name != "joint_names"
-    }
-    if any(each.shape != (len(joint_names),) for each in found.values()):
-        raise ValueError("the figures do not match the joints")
-    return HeldOutFigures(joint_names, **found)
 
 
 def answer_of(model: TorqueModel, samples: Samples) -> TorqueDistribution:

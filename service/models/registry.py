@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
 from sqlalchemy import bindparam, func, select, tuple_, update
 from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.estimators.base import RobotKind
 from lipcore.files.persistence import checksums, read_manifest
-from service.contract.models import HeldOutQuality, Model, ModelPage, Promotion, Version, VersionSummary
+from service.contract.models import Model, ModelPage, Promotion, Version, VersionSummary
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
 from service.foundation.settings import shipped_models
+from service.models import verdicts
 from service.storage import audit
 from service.storage.database import (
     AliasMoveRow,
@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 SHIPPED = "panda-sim"
 SERVING = "serving"
 """The alias of every model for its serving version."""
+CANDIDATE = "candidate"
+"""The alias of the newest version that waits for approval."""
 MAX_ALIASES = 100
 """Maximum aliases of one model, besides `serving`."""
 
@@ -307,7 +309,8 @@ def show_version(database: Database, model: str, version: int) -> Version:
     """Return one version with its lineage; raise NotFoundError."""
     row = find(database, model, version)
     fields = {name: row.manifest[name] for name in Version.model_fields if name in row.manifest}
-    return Version(model=row.model, version=row.version, created_at=row.created_at, job=row.job, **fields)
+    about = {"model": row.model, "version": row.version, "created_at": row.created_at, "job": row.job}
+    return Version(**about, verdict=verdicts.of_version(row.manifest), **fields)
 
 
 def page(database: Database, part: Page) -> ModelPage:
@@ -333,23 +336,12 @@ def _show(session: Session, row: ModelRow) -> Model:
                 version=v.version,
                 created_at=v.created_at,
                 estimator=v.manifest["estimator"],
-                quality=quality(v.manifest),
+                verdict=verdicts.of_version(v.manifest),
                 promotion=v.manifest.get(PROMOTION),
             )
             for v in versions
         ],
     )
-
-
-def quality(manifest: Mapping[str, Any]) -> HeldOutQuality | None:
-    """Return the held-out figures of a version's manifest; None if missing or in another form.
-
-    Imports keep figures that this release cannot read.
-    """
-    try:
-        return HeldOutQuality.model_validate(manifest["lineage"]["holdout"])
-    except (KeyError, TypeError, ValidationError):
-        return None
 
 
 def rows_of(session: Session, keys: Collection[tuple[str, int]]) -> dict[tuple[str, int], VersionRow]:

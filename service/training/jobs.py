@@ -33,7 +33,7 @@ from service.foundation.errors import (
 )
 from service.foundation.fields import first_repeat
 from service.journal import log
-from service.models import registry
+from service.models import registry, verdicts
 from service.models.loaded import LoadedModels
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, JobRow, RobotRow, VersionRow, now
@@ -289,15 +289,15 @@ def represent(row: JobRow) -> Job:
 
 
 def represent_all(database: Database, rows: Sequence[JobRow]) -> list[Job]:
-    """Return jobs as the API shows them, with the quality of the versions that they made."""
+    """Return jobs as the API shows them, with the verdicts on the versions that they made."""
     made = {(row.model, row.version) for row in rows if row.version is not None}
     with database.session() as session:
         versions = registry.rows_of(session, made) if made else {}
     jobs = []
     for row in rows:
         version = None if row.version is None else versions.get((row.model, row.version))
-        quality = None if version is None else registry.quality(version.manifest)
-        jobs.append(represent(row).model_copy(update={"quality": quality}))
+        verdict = None if version is None else verdicts.of_version(version.manifest)
+        jobs.append(represent(row).model_copy(update={"verdict": verdict}))
     return jobs
 
 

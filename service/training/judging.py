@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from lipcore.data.metrics import BlockScores
 from lipcore.estimators.noise import white
 from lipcore.model.torque_model import TorqueModel
 from service.contract.holdout import Evaluation
 from service.foundation.fields import finite
-from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
+from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation, range_figures
 from service.models.lineage import answer_of, figures
+from service.models.verdicts import torque_limits
 from service.training import repeating
 from service.training.material import TrainingData
 from service.training.table import TablePart
@@ -25,11 +28,18 @@ def judged_figures(model: TorqueModel, data: TrainingData) -> dict[str, Any]:
     assert table is not None  # something was held out
     samples = table.thinned(most)
     repeats = repeating.find_repetition(data.table.parts, samples, model.joint_types)
-    judged = {"judged_rows": data.rows, "torque_noise": white(data.samples, data.stretches).tolist()}
+    answer = answer_of(model, samples)
+    judged = {
+        "judged_rows": data.rows,
+        # of thinned samples, `white` contains motion
+        "torque_noise": np.minimum(white(data.samples, data.stretches), white(samples)).tolist(),
+        "torque_limit": torque_limits([part.row for part in table.parts]),
+        **range_figures(samples, answer, model.training_range),
+    }
     found = {**judged, **figures(model, samples, most, len(table)), **repeats}
     if data.every is None:
         return found
-    scores = BlockScores.of(samples, answer_of(model, samples))
+    scores = BlockScores.of(samples, answer)
     nlpd, nmse = (finite(sums) for sums in scores.sums.T)
     blocks = {"rows": scores.rows.tolist(), "nlpd": nlpd, "nmse": nmse}
     evaluations = {part.row.id: _evaluation(model, data, part, most) for part in table.parts}
@@ -39,6 +49,6 @@ def judged_figures(model: TorqueModel, data: TrainingData) -> dict[str, Any]:
 def _evaluation(model: TorqueModel, data: TrainingData, part: TablePart, most: int) -> dict[str, Any]:
     """Return the evaluation of the fit on the held-out rows of one data set."""
     _, samples = part.motion(most)
-    found = evaluation(samples, answer_of(model, samples))
+    found = evaluation(samples, answer_of(model, samples), model.training_range)
     repeats = repeating.find_repetition(data.table.parts, samples, model.joint_types)
     return Evaluation(samples=len(part), **found, **repeats).model_dump(mode="json")

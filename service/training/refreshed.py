@@ -16,7 +16,6 @@ from sqlalchemy.orm import Session
 from lipcore.data import metrics
 from lipcore.data.metrics import MIN_BLOCKS, BlockScores
 from lipcore.data.samples import Samples
-from lipcore.model.acceptance import Acceptance
 from lipcore.model.torque_model import TorqueModel
 from service.contract.models import Promotion
 from service.contract.observations import LearningOptions
@@ -37,7 +36,8 @@ from service.training.refresh_data import ComparisonRows
 class RefreshComparison:
     """Comparison of a refreshed version with the version that it refreshes; `evidence` has its figures as JSON."""
 
-    acceptance: Acceptance
+    better: bool
+    reason: str
     evidence: dict[str, Any]
 
 
@@ -47,7 +47,7 @@ def compare(
     """Compare the judged fit of a refresh with the version that it refreshes, on rows that neither has learnt."""
     name = f"version {serving.version}"
     if rows is None or len(metrics.blocks(rows.samples)) < MIN_BLOCKS:
-        return RefreshComparison(Acceptance(unknown=(texts.describe_too_few_logged(name),)), {})
+        return RefreshComparison(False, texts.describe_too_few_logged(name), {})
     samples, key = rows.samples, (serving.model, serving.version)
     base = files.load_version(serving.folder, serving.checksums)
     known = restore(database, files, *key, base, rows.after)
@@ -63,8 +63,8 @@ def compare(
         "figures": {which: _figures(samples, answer) for which, answer in answers.items()},
     }
     better = bool(found.significant[0] and found.mean[0] < 0)
-    reason = (texts.describe_newest_rows(better, name, found.mean[0], found.half_width[0]),)
-    return RefreshComparison(Acceptance(speaks_for=reason) if better else Acceptance(against=reason), evidence)
+    reason = texts.describe_newest_rows(better, name, found.mean[0], found.half_width[0])
+    return RefreshComparison(better, reason, evidence)
 
 
 def promote(session: Session, model: str, version: int, judged: Promotion, evidence: dict[str, Any]) -> str:
@@ -84,7 +84,7 @@ def promote(session: Session, model: str, version: int, judged: Promotion, evide
         after = {"verdict": verdict, "serving": serving}
         audit.note(session, model, "candidate dismissed", version, after=after)
     named = {"serving": judged.serving, "candidate": version, "verdict": verdict, "promoted": promoted}
-    raise_alarm(session, model, "promotion", f"Version {version} {outcome}.", {**named, **evidence})
+    raise_alarm(session, model, "promotion", f"Version {version} {outcome}", {**named, **evidence})
     return outcome
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-NOT_JUDGED = "not judged, because no rows were held out"
 TAKEN_BACK = "observations that it was trained on have been unlearnt or rolled back meanwhile: refresh again"
 CANCELLED_WAITING = "cancelled while waiting"
 CANCELLED_RUNNING = "cancelled while running"
@@ -69,7 +68,7 @@ def describe_outcome(version: int, outcome: str) -> str:
 
 
 def describe_promotion(serves: bool, reason: str) -> str:
-    """Return whether a trained version serves."""
+    """Return whether a trained version serves. reason: sentences."""
     return f"{'is now serving' if serves else 'is a candidate'}: {reason}"
 
 
@@ -78,53 +77,57 @@ def describe_refresh(version: int, reason: str, better: bool, promoted: bool) ->
     if promoted:
         return f"is now serving: {reason}"
     if better:
-        return f"is a candidate: {reason}; roll back to version {version} to let it serve"
+        return f"is a candidate: {reason} Roll back to version {version} to let it serve."
     return f"is dismissed: {reason}"
 
 
 def describe_changed_serving(serving: int) -> str:
     """State that another version has become the serving version since the comparison."""
-    return f"not compared with version {serving}, which became the serving version meanwhile"
+    return f"It was not compared with version {serving}, which became the serving version meanwhile."
 
 
 def describe_other_robot(name: str) -> str:
     """State that the serving version is of another robot."""
-    return f"{name} is of another robot"
+    return f"{_start(name)} is of another robot."
 
 
 def describe_unreadable(name: str) -> str:
     """State that the serving version cannot be read."""
-    return f"not compared with {name}, which cannot be read"
+    return f"It was not compared with {name}, which cannot be read."
 
 
 def describe_learnt_held_out(name: str) -> str:
     """State that the serving version has learnt the held-out rows."""
-    return f"not compared with {name}, which was trained on the held-out rows"
+    return f"It was not compared with {name}, which was trained on the held-out rows."
 
 
 def describe_too_short(name: str) -> str:
     """State that the held-out rows are too few for a comparison."""
-    return f"not compared with {name}, because too few rows are held out"
+    return f"It was not compared with {name}, because too few rows are held out."
 
 
 def describe_too_few_logged(name: str) -> str:
     """State that the logged rows are too few for a comparison."""
-    return f"not compared with {name}, because too few rows are logged"
+    return f"It was not compared with {name}, because too few rows are logged."
 
 
 def describe_density(how: str, name: str, difference: float, half_width: float) -> str:
     """Return how predictions of the held-out rows compare. how: "better", "worse" or "no worse"."""
     amount = f"negative log density {difference:+.3g} ± {half_width:.2g} nats per sample"
-    return f"its predictions of the held-out rows are {how} than those of {name} ({amount})"
+    return f"Its predictions of the held-out rows are {how} than those of {name} ({amount})."
 
 
 def describe_larger_errors(name: str, difference: float, half_width: float) -> str:
     """State that errors are larger than those of the serving version."""
-    return f"its errors are larger than those of {name} (mean nMSE {difference:+.2g} ± {half_width:.1g})"
+    return f"Its errors are larger than those of {name} (mean nMSE {difference:+.2g} ± {half_width:.1g})."
 
 
 def describe_newest_rows(better: bool, name: str, difference: float, half_width: float) -> str:
     """Return how predictions of the newest logged rows compare."""
     amount = f"negative log density {difference:+.3g} ± {half_width:.2g} nats per row"
     how = "better" if better else "no better"
-    return f"its predictions of the newest logged rows are {how} than those of {name} ({amount})"
+    return f"Its predictions of the newest logged rows are {how} than those of {name} ({amount})."
+
+
+def _start(name: str) -> str:
+    return f"{name[0].upper()}{name[1:]}"

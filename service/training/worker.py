@@ -191,8 +191,8 @@ def _judged(
     with database.session() as session:
         serving = session.get_one(VersionRow, (claim.model, refresh["version"]))
     compared = refreshed.compare(database, files, serving, trained, data.unlearnt)
-    lineage["refresh"] = {**lineage["refresh"], "compared": compared.acceptance.reason, "evidence": compared.evidence}
-    return Promotion.of(compared.acceptance, serving.version)
+    lineage["refresh"] = {**lineage["refresh"], "compared": compared.reason, "evidence": compared.evidence}
+    return Promotion.of(compared.better, compared.reason, serving.version)
 
 
 def _publish(

@@ -74,7 +74,7 @@ def _own_files(request: pytest.FixtureRequest, services_share: bool) -> None:
 @pytest.fixture(scope="session")
 def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A service with default settings; its data sets and models accumulate over the session."""
-    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api"))), ADDRESS) as client:
+    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("api"), promotion="always")), ADDRESS) as client:
         yield client
 
 

@@ -41,7 +41,8 @@ class Server:
         self.url = f"http://127.0.0.1:{self.port}"
         self.client = httpx.Client(base_url=self.url, timeout=DEADLINE)
         arguments = ["serve", "--port", str(self.port)]
-        environment = {**os.environ, "LIPSERVE_HOME": str(home), **backend.environment(home), **settings}
+        given = {"LIPSERVE_HOME": str(home), "LIPSERVE_PROMOTION": "always", **settings}
+        environment = {**os.environ, **backend.environment(home), **given}
         self.process = (
             Served(arguments, environment, self.log, constants) if warm else self._spawned(arguments, environment)
         )

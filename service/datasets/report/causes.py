@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.data.samples import Array
+from lipcore.data.signals import noise_level
 from service.contract.datasets import JointExcitation, Remedy
 from service.datasets.report import texts
 from service.datasets.report.bodies import (
@@ -66,11 +67,13 @@ class TorqueWork:
 
     Kinetic and potential energy return; energy lost to friction does not, so that work has a trend.
 
-    power: slope of the trend, W; trend: rise of the trend over the recording, divided by the span of work around it.
+    power: slope of the trend, W; trend: rise of the trend over the recording, divided by the span of work around it;
+    std: standard error of the power by white noise, W.
     """
 
     power: float
     trend: float
+    std: float
 
     @classmethod
     def of(cls, power: Array) -> TorqueWork:
@@ -78,7 +81,8 @@ class TorqueWork:
         work = np.cumsum(power)
         along = np.linspace(-0.5, 0.5, len(work))
         slope = float(along @ work / (along @ along))
-        return cls(slope / len(work), slope / max(float(np.ptp(work - slope * along)), 1e-300))
+        trend = slope / max(float(np.ptp(work - slope * along)), 1e-300)
+        return cls(slope / len(work), trend, float(noise_level([power[:, None]])[0]) / np.sqrt(len(power)))
 
 
 def find_faults(
@@ -122,7 +126,8 @@ def _friction_sign(joint: JointExcitation, dq: Array, tau: Array) -> int:
 def _check_work(upload: Upload, signals: Signals, work: TorqueWork) -> Remedy | None:
     """Report torques that do negative work on the motion. This needs no robot."""
     usual = float(np.sqrt(np.mean(signals.dq**2, axis=0)) @ np.sqrt(np.mean(signals.tau**2, axis=0)))
-    if work.trend > -CAUSE.trend or work.power > -FRICTION.negative_share * usual:
+    least = max(FRICTION.negative_share * usual, CAUSE.stds * work.std)
+    if work.trend > -CAUSE.trend or work.power > -least:
         return None
     return make_remedy(
         "torque_sign",

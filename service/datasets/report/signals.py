@@ -204,6 +204,7 @@ def compare_with_limits(joint: int, name: str, columns: dict[str, Array], limits
         joint=name,
         range_used=range_used,
         speed_used=speed_used,
+        torque_limit=torque if np.isfinite(torque) else None,
         torque_used=torque_used,
         beyond_range=beyond_range,
         beyond_speed=beyond_speed,

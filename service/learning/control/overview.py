@@ -23,11 +23,11 @@ from service.contract.overview import (
 from service.learning.control import payload
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.models import registry
+from service.models import registry, verdicts
 from service.models.loaded import ServedModel
+from service.models.registry import CANDIDATE
 from service.storage.database import AlarmRow, EventRow, LearningRow, ModelRow
 from service.storage.rows import Page, read_page
-from service.training.promotion import CANDIDATE
 
 HOUR_S = 3600.0
 DECIMALS = 3
@@ -64,7 +64,7 @@ def list_models(learners: Learners, part: Page) -> OverviewPage:
                 created_at=version.created_at,
                 joint_names=manifest["joint_names"],
                 joint_types=manifest["joint_types"],
-                quality=registry.quality(manifest),
+                verdict=verdicts.of_version(manifest),
                 candidate=pointers.get((row.name, CANDIDATE)),
                 arm=sketch_arm(manifest),
                 position=_position(learners, row.name, manifest),

@@ -66,7 +66,7 @@ def test_unreachable_service_error_has_a_hint(client, tmp_path):
         with pytest.raises(ServiceUnreachableError, match=f"no service answers at {url}.*lipserve serve"):
             alone.model("panda-sim")
         with pytest.raises(ValueError, match=r"expected one of the suffixes \.csv, "):  # before anything is sent
-            alone.upload(tmp_path / "stream.xlsx")
+            alone.upload(tmp_path / "stream.pickle")
 
 
 def ask(url, work, transport=None):

@@ -2,6 +2,7 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from lipcore.robots.urdf import RigidBody
 from lipserve.call import Answer
 from lipserve.records.live import LiveLost
+from lipserve.records.models import Verdict
 from lipserve.results.arm import Arm, Version, read_arm
 from lipserve.results.evaluation import read_evaluation
 from lipserve.results.series import LiveRows, read_live
@@ -18,12 +20,18 @@ from tests.lipcore.remembering import remembering_model, remembering_samples
 from tests.service.data import stream, upload
 from tests.service.models.versions import JOINTS, panda, publish
 
+UNJUDGED = {
+    **{"level": "not_judged", "serves": False, "label": "not judged", "reason": "It was <trained>.", "action": "Wait."},
+    **{"judged_on": "training", "outside": 0.25, "repeats": None, "joints": []},
+}
 EVALUATION = {
     **{"model": "m<b>", "version": 2, "revision": 3, "dataset": "ds_1", "part": "all", "joint_names": ["a", "b"]},
     **{"samples": 100, "samples_used": 50, "level": 0.95, "nmse": [0.0123, None], "rmse": [0.5, 0.25]},
     **{"coverage": [0.94, 1.0], "nlpd": [-1.5, 0.125], "interval_width": [2.0, 1.0], "in_training": True},
     **{"independent": [12.4, 8.0], "coverage_low": [0.6, 0.63], "coverage_high": [1.0, 1.0]},
     **{"repeats_training": 0.97, "period_s": 5.0, "warnings": ["97 % repeat: <flatters>"], "judged": False},
+    **{"torque_range": [4.0, 2.0], "outside": {"share": 0.25, "squared": [0.5, 0.1], "coverage": [0.9, 1.0]}},
+    "verdict": UNJUDGED,
     "coverages": [{"level": 0.5, "coverage": [0.5, 0.6], "interval_width": [0.7, 0.4]}],
     "reliability": {"nominal": [0.5, 0.9], "observed": [[0.5, 0.9], [0.6, 0.95]]},
     "stretches": {"kind": "equal", "samples": [25, 25], "nmse": [[0.01, 0.02], [None, None]]},
@@ -85,10 +93,11 @@ def test_evaluation_prints_as_a_table():
         "joint      nMSE  RMSE N·m  coverage (95 %)  95 % CI from     to  effective samples  width N·m  NLPD nats",
         "a      1.23e-02    0.5000           94.0 %          60 %  100 %                 12      2.000     -1.500",
         "b             -    0.2500          100.0 %          63 %  100 %                  8      1.000      0.125",
+        "not judged: It was <trained>.",
         "warning: 97 % repeat: <flatters>",
     ]
     html = found._repr_html_()
-    assert html.endswith("<p>warning: 97 % repeat: &lt;flatters&gt;</p>")
+    assert html.endswith("<p>not judged: It was &lt;trained&gt;.</p><p>warning: 97 % repeat: &lt;flatters&gt;</p>")
     assert [part for part in ("<caption>m&lt;b&gt; version 2", "<td>1.23e-02</td>") if part not in html] == []
     first, second = found.rows()
     assert (first["joint"], first["nmse"], first["coverage"], second["rmse"]) == ("a", 0.0123, 0.94, 0.25)
@@ -103,7 +112,9 @@ def test_evaluation_as_dict_equals_the_answer(api, local, trained):
     asked = {"dataset": trained.dataset}
     answered = api.post(f"/v1/models/{trained.name}/evaluate", json=asked).json()
     unknown = {"repeats_training": None, "period_s": None}  # of samples that it was trained on
-    assert local.evaluate(trained.name, trained.dataset).as_dict() | unknown == answered
+    found = local.evaluate(trained.name, trained.dataset).as_dict()
+    assert found["outside"] == {"share": 0.0, "squared": [None, None], "coverage": [None, None]}
+    assert found | unknown == answered
 
 
 def test_comparison_prints_verdict_and_warnings(api, local, pendulum):
@@ -169,6 +180,7 @@ def version(parameters, **given) -> Version:
     known |= {"joint_names": list(REVERSED), "joint_types": ["revolute"] * 7, "torque_convention": "gravity_included"}
     known |= {"noise_std": [0.1] * 7, "parameters": parameters, "warnings": []}
     nothing = ("training_range", "options", "fit", "compact", "calibration", "hyperparameters", "lineage")
+    known["verdict"] = msgspec.convert(UNJUDGED, Verdict)
     return Version(**{**known, **{name: {} for name in nothing}, **given})
 
 

@@ -21,17 +21,18 @@ def test_models_are_listed_and_shown(run_command, arm):
     assert shown["version"]["version"] == shown["model"]["serving_version"]
     text = run_command("models", "show", name, "--version", 1)
     assert "version 1: se, 2 joints: joint1, joint2" in text
-    assert "no data were held out" in text
+    assert "not judged: No samples were held out of its training" in text
 
 
 def test_promotion_can_be_rolled_back(run_command, arm):
     name, _ = arm
-    assert run_command("models", "promote", name, 1, "--json")["version"] == 1
-    assert f"serving → {name} version 2" in run_command("models", "promote", name, 2)
+    promote = ("models", "promote", name)
+    assert run_command(*promote, 1, "--json")["version"] == 1
+    assert f"serving → {name} version 2" in run_command(*promote, 2)
     assert run_command("models", "rollback", name, "--json")["version"] == 1
-    run_command("models", "promote", name, 2)
-    assert "version 1" in run_command("models", "promote", name, 1, "--alias", "night")
-    assert run_command("models", "promote", name, "night", "--alias", "day", "--json")["version"] == 1
+    run_command(*promote, 2)
+    assert "version 1" in run_command(*promote, 1, "--alias", "night")
+    assert run_command(*promote, "night", "--alias", "day", "--json")["version"] == 1
     assert run_command("predict", name, "--q", "0.1,0.2", "--alias", "day", "--json")["version"] == 1
     assert f"day → {name} version 1" in run_command("models", "alias", name, "day")
     run_command("models", "alias", name, "day", 2)

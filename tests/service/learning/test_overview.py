@@ -98,20 +98,21 @@ def test_overview_shows_the_arm_of_the_version(learning_service):
 
 
 @pytest.mark.slow
-def test_held_out_quality_is_the_same_on_all_routes(api):
+def test_verdict_is_the_same_on_all_routes(api):
     data = upload(api, stream(samples=150, seed=8))["id"]
     job = train(api, "judged-everywhere", data, holdout={"kind": "last", "share": 0.3})
     kept = read_json(api.get("/v1/models/judged-everywhere/versions/1"))["lineage"]["holdout"]
-    expected = {name: kept[name] for name in ("samples", "nmse", "coverage", "coverage_low", "coverage_high")}
-    assert None not in expected["nmse"]
     [summary] = read_json(api.get("/v1/models/judged-everywhere"))["versions"]
     listed = read_json(api.get("/v1/jobs", params={"limit": 1}))["items"][0]
-    assert summary["quality"] == job["quality"] == listed["quality"] == expected
-    assert find_overview(api, "judged-everywhere")["quality"] == expected
-    assert summary["promotion"]["passed"] in (True, False)
-    assert summary["promotion"]["reason"]
+    verdict = summary["verdict"]
+    assert [each["rmse"] for each in verdict["joints"]] == kept["rmse"]
+    assert [each["coverage"] for each in verdict["joints"]] == kept["coverage"]
+    shown = read_json(api.get("/v1/models/judged-everywhere/versions/1"))
+    assert shown["verdict"] == job["verdict"] == listed["verdict"] == verdict
+    assert find_overview(api, "judged-everywhere")["verdict"] == verdict
+    assert verdict["reason"] in summary["promotion"]["reason"]
 
     train(api, "judged-nowhere", data, holdout=None)
     [summary] = read_json(api.get("/v1/models/judged-nowhere"))["versions"]
-    assert (summary["quality"], find_overview(api, "judged-nowhere")["quality"]) == (None, None)
+    assert (summary["verdict"]["level"], summary["verdict"]["judged_on"]) == ("not_judged", "nothing")
     assert find_overview(api, "judged-nowhere")["arm"] is None

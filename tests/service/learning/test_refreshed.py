@@ -58,7 +58,7 @@ def compare_model(arm, seconds, rows):
 )
 def test_candidate_is_accepted_if_it_predicts_newest_rows_better(arm, seconds, passed, words):
     found = compare_model(arm, seconds, make_comparison_rows(*range(TRAINED_EVENTS, 26)))
-    assert (found.acceptance.passed, words in found.acceptance.reason) == (passed, True)
+    assert (found.better, words in found.reason) == (passed, True)
     assert (found.evidence["rows"], found.evidence["blocks"]) == (22 * SECOND_ROWS, 22)
     better = found.evidence["gain"] > 2 * found.evidence["standard_error"]
     assert better == passed
@@ -67,9 +67,9 @@ def test_candidate_is_accepted_if_it_predicts_newest_rows_better(arm, seconds, p
 
 def test_too_few_rows_give_no_verdict(arm):
     for rows in (None, make_comparison_rows(4, 5, 6)):
-        acceptance = compare_model(arm, 14, rows).acceptance
-        assert acceptance.passed is None
-        assert acceptance.reason == "not compared with version 1, because too few rows are logged"
+        found = compare_model(arm, 14, rows)
+        assert (found.better, found.evidence) == (False, {})
+        assert found.reason == "It was not compared with version 1, because too few rows are logged."
 
 
 def test_newest_third_of_learnt_rows_is_compared(arm):

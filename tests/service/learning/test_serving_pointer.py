@@ -116,8 +116,8 @@ EVIDENCE = {"rows": 700, "gain": 0.5, "standard_error": 0.1}
 
 def decide_refresh(learning_service, learning_model, version=2, better=True, serving=1):
     """Judge a refreshed version as its job and the service do; return the outcome in words."""
-    service, reason = learning_service.service, f"it predicts the newest logged rows {'' if better else 'no '}better"
-    promotion = Promotion(answers=better, passed=better, serving=serving, reason=reason)
+    service, reason = learning_service.service, f"It predicts the newest logged rows {'' if better else 'no '}better."
+    promotion = Promotion(answers=better, serving=serving, reason=reason)
     with service.database.transaction() as session:
         outcome = refreshed.promote(session, learning_model.name, version, promotion, EVIDENCE)
     service.loaded.changed(learning_model.name)
@@ -137,7 +137,7 @@ def test_candidate_serves_and_learns_if_better(learning_service, learning_model,
     learning_service.publish(learning_model.name, candidate=True)
     assert read_serving_versions(learning_model) == (1, 1)
     outcome = decide_refresh(learning_service, learning_model, better=better)
-    assert outcome.startswith("is now serving: it predicts" if better else "is dismissed: it predicts")
+    assert outcome.startswith("is now serving: It predicts" if better else "is dismissed: It predicts")
     serving, dismissed = (2, 1) if better else (1, 2)
     assert learning_service.service.loaded.hot(learning_model.name, None).version == serving
     assert read_serving_versions(learning_model) == (serving, serving)
@@ -175,7 +175,7 @@ def test_old_automatic_versions_are_deleted_unless_needed(learning_service, lear
     end_refresh(2, "novelty", True)
     end_refresh(3, "asked", True)  # 2 is kept as the target of a rollback
     end_refresh(4, "linearisation", False)
-    learning_model.put("aliases/liked", {"version": 4})
+    learning_model.put("aliases/liked", {"version": 4, "override": True})
     end_refresh(5, "novelty", False)
     assert list_versions() == [1, 2, 3, 4, 5]
     end_refresh(6, "novelty", False)
@@ -192,7 +192,7 @@ def test_candidate_waits_without_auto_promote(learning_service, learning_model):
     assert read_serving_versions(learning_model) == (1, 1)
     [alarm] = learning_model.get("alarms")["items"]
     assert alarm["evidence"] == {"serving": 1, "candidate": 2, "verdict": "promote", "promoted": False, **EVIDENCE}
-    assert "roll back to version 2" in alarm["message"]
+    assert "Roll back to version 2" in alarm["message"]
     learning_model.post("rollback", {"version": 2})
     assert read_serving_versions(learning_model) == (2, 2)
 

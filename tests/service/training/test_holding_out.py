@@ -130,12 +130,13 @@ def test_evaluation_and_trace_find_the_held_out_rows_again(api, jobs, dataset, m
 
 def test_evaluation_of_the_judged_fit_is_complete(api, jobs, dataset):
     judged, computed = (evaluation(api, model, dataset, part="held_out") for model in jobs)
-    for name in computed.keys() - {"model", "judged", "joint_names", "warnings"}:
-        if isinstance(computed[name], list) or name in ("reliability", "stretches"):
+    for name in computed.keys() - {"model", "judged", "joint_names", "warnings", "verdict"}:
+        if isinstance(computed[name], list) or name in ("reliability", "stretches", "outside"):
             np.testing.assert_allclose(json_numbers(judged[name]), json_numbers(computed[name]), rtol=1e-6)
         else:
             assert judged[name] == computed[name], name
     assert [judged[name] for name in ("joint_names", "warnings")] == [computed["joint_names"], computed["warnings"]]
+    assert judged["verdict"]["level"] == computed["verdict"]["level"]
 
 
 def resting_joint_recording():
@@ -285,7 +286,7 @@ def test_refresh_holds_out_the_same_samples(api):
         assert after["lineage"]["holdout"][name] == before["lineage"]["holdout"][name]
     assert after["fit"]["samples_given"] == before["fit"]["samples_given"] == ROWS
     compared = after["lineage"]["refresh"]["compared"]
-    assert compared == "not compared with version 1, because too few rows are logged"
+    assert compared == "It was not compared with version 1, because too few rows are logged."
     assert seen["history"][-1]["message"] == f"version 2 is trained and is dismissed: {compared}"
     answer = evaluation(api, "refreshed-held", dataset, part="held_out", version=2)
     np.testing.assert_allclose(answer["nmse"], after["lineage"]["holdout"]["nmse"], rtol=1e-6)

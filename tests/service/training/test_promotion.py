@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from lipcore.model.texts import NOTHING_HELD_OUT
 from service.contract.holdout import HeldOutBlocks
 from service.contract.models import Promotion
 from service.models.registry import serving_version
@@ -38,14 +39,21 @@ def reason(api, model, number):
 
 def promotion(api, model, number):
     found = version_of(api, model, number)["promotion"]
-    return found["answers"], found["passed"], found["serving"]
+    return found["answers"], found["serving"]
+
+
+def level(api, model, number):
+    return version_of(api, model, number)["verdict"]["level"]
 
 
 @pytest.fixture(scope="module")
 def judged_jobs(api):
     """Jobs of a model with four versions. Version 1 serves. The held-out part of 2 and 4 is noisier than their training
     rows; 4 is promoted always. Version 3 has learnt from noise, and its intervals are as wide as they should be."""
-    narrow, noisy = upload_recording(api, 32, slice(CUT, None)), upload_recording(api, 34, slice(0, CUT - 10), 20.0)
+    narrow, noisy = (
+        upload_recording(api, 32, slice(CUT, None), 0.3),
+        upload_recording(api, 34, slice(0, CUT - 10), 10.0),
+    )
     train(api, "judged", upload_recording(api, 31))
     jobs = [train(api, "judged", each, holdout=HELD, promotion="ask") for each in (narrow, noisy)]
     jobs.append(train(api, "judged", narrow, holdout=HELD, promotion="always"))
@@ -54,28 +62,25 @@ def judged_jobs(api):
 
 @pytest.mark.slow
 def test_version_without_held_out_data_serves_only_on_request(api, judged_jobs):
-    why = "not judged, because no rows were held out"
+    why = f"Not judged. {NOTHING_HELD_OUT}"
     train(api, "unjudged", upload_recording(api, 31), promotion="ask")
-    assert promotion(api, "judged", 1) == (True, None, None)
-    assert reason(api, "judged", 1) == f"{why}; it serves, because `promotion` is always"
-    assert promotion(api, "unjudged", 1) == (False, None, None)
+    assert promotion(api, "judged", 1) == (True, None)
+    assert reason(api, "judged", 1) == f"{why} It serves, because `promotion` is always."
+    assert promotion(api, "unjudged", 1) == (False, None)
     assert reason(api, "unjudged", 1) == why
 
 
 def test_version_that_fails_on_held_out_data_serves_only_if_the_request_demands_it(api, judged_jobs):
-    assert [promotion(api, "judged", number) for number in (2, 3, 4)] == [
-        (False, False, 1),
-        (False, False, 1),
-        (True, False, 1),
-    ]
+    assert [promotion(api, "judged", number) for number in (2, 3, 4)] == [(False, 1), (False, 1), (True, 1)]
+    assert [level(api, "judged", number) for number in (2, 4)] == ["wrong", "wrong"]
     narrow, worse, demanded = (reason(api, "judged", number) for number in (2, 3, 4))
-    assert "coverage of the 95 % intervals is below 90 %: joint1" in narrow
+    assert narrow.startswith("Wrong. The 95 % intervals are too narrow: joint1")
     assert "effective samples" in narrow
     assert judged_jobs[0]["history"][-1]["message"] == f"version 2 is trained and is a candidate: {narrow}"
-    assert "its predictions of the held-out rows are worse than those of version 1" in worse
+    assert worse.startswith("Wrong. The errors are no smaller than with the mean torque: joint1")
     assert min(version_of(api, "judged", 3)["lineage"]["holdout"]["coverage"]) > 0.9
     assert judged_jobs[2]["promotion"] == "always"
-    assert demanded.endswith("it serves, because `promotion` is always")
+    assert demanded.endswith("It serves, because `promotion` is always.")
 
 
 def test_newest_candidate_has_an_alias_and_can_be_promoted(api, judged_jobs):
@@ -89,14 +94,14 @@ def test_newest_candidate_has_an_alias_and_can_be_promoted(api, judged_jobs):
     moved = api.put("/v1/models/judged/aliases/serving", json={"alias": "candidate"})
     assert moved.status_code == 200, moved.text
     assert predict_json(api, "judged")["version"] == 3
-    assert promotion(api, "judged", 3) == (False, False, 1)  # recorded at the end of the training
+    assert promotion(api, "judged", 3) == (False, 1)  # recorded at the end of the training
     assert "'candidate'" in error(api.delete("/v1/models/judged/versions/3"), 409, "conflict")["message"]
     assert api.delete("/v1/models/judged/versions/2").status_code == 204
 
 
 def test_model_has_no_serving_version_if_its_first_fails(api):
     train(api, "first-bad", upload_recording(api, 35, slice(CUT, None)), holdout=HELD, promotion="ask")
-    assert promotion(api, "first-bad", 1) == (False, False, None)
+    assert promotion(api, "first-bad", 1) == (False, None)
     model = api.get("/v1/models/first-bad").json()
     assert (model["serving_version"], model["aliases"]) == (None, {"candidate": 1})
     assert [each["alias"] for each in api.get("/v1/models/first-bad/aliases").json()["items"]] == ["candidate"]
@@ -126,7 +131,7 @@ def test_motion_unrelated_to_the_torque_does_not_serve(api):
     samples = stream(samples=ROWS, rate=10.0, seed=33)
     others = replace(samples, tau=stream(samples=ROWS, rate=10.0, seed=36).tau)
     train(api, "others", upload(api, others)["id"], holdout=HELD, promotion="ask")
-    assert "the error is not below that of the mean torque: joint1" in reason(api, "others", 1)
+    assert "The errors are no smaller than with the mean torque: joint1" in reason(api, "others", 1)
 
 
 def test_versions_of_a_model_have_one_robot(api):
@@ -156,7 +161,10 @@ def test_versions_of_a_model_have_one_robot(api):
 def test_versions_with_equal_held_out_rows_are_compared_by_their_scores(api):
     """Each row has what versions 1 and 2 hold out, and the reason that both get."""
     dataset = upload_recording(api, 37)
-    fair, unfair = "than those of version 1 (negative log density", "not compared with version 1, which was trained on"
+    fair, unfair = (
+        "than those of version 1 (negative log density",
+        "not compared with version 1, which was trained",
+    )
     kept = {**HELD, "only": True}
     cases = [(HELD, HELD, fair), (kept, HELD, fair), (HELD, kept, fair), (kept, kept, fair)]
     cases += [(HELD, {"share": 0.4}, unfair), (None, HELD, unfair)]
@@ -174,7 +182,7 @@ def test_worse_retrained_version_is_a_candidate(api):
     dataset = upload_recording(api, 40)
     train(api, "worse", dataset, holdout=HELD)
     train(api, "worse", dataset, holdout=HELD, estimator="se", promotion="ask")
-    assert "its predictions of the held-out rows are worse than those of version 1" in reason(api, "worse", 2)
+    assert "Its predictions of the held-out rows are worse than those of version 1" in reason(api, "worse", 2)
     assert api.get("/v1/models/worse").json()["serving_version"] == 1
 
 
@@ -191,7 +199,7 @@ def test_imported_scores_of_a_judged_fit_are_checked(change):
 def test_version_is_a_candidate_if_the_serving_one_has_changed(api, judged_jobs):
     with service_of(api).database.session() as session:
         now = serving_version(session, "judged")
-        good = Promotion(answers=True, passed=True, serving=now + 1, reason="")
+        good = Promotion(answers=True, serving=now + 1, reason="")
         found = settle(session, "judged", good, "ask")
         assert (found.answers, found.serving) == (False, now)
         assert f"not compared with version {now}" in found.reason

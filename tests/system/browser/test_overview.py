@@ -51,17 +51,20 @@ def changed(page: Page, name: str, **fields: Any) -> None:
 
 def test_card_shows_quality_of_each_joint(visitor: Visitor, judged: dict[str, Any]) -> None:
     place = card(visitor.open("#/"), "judged")
+    expect(place).to_contain_text(judged["verdict"]["label"])
     expect(place).to_contain_text("Version 1, lip-chain")
     expect(place).to_contain_text("no stream yet")
     expect(place).to_contain_text("On held-out rows.")
     label = place.get_by_role("img", name="nMSE by joint").get_attribute("aria-label")
     assert label is not None
     told = [float(each) for each in re.findall(r"joint\d ([\d.e-]+)", label)]
-    assert told == pytest.approx(judged["quality"]["nmse"], rel=0.05)
+    joints = judged["verdict"]["joints"]
+    expected = [(each["rmse"] / each["mean_rmse"]) ** 2 for each in joints]
+    assert told == pytest.approx(expected, rel=0.05)
     label = place.get_by_role("img", name="Coverage of the 95 % interval").get_attribute("aria-label")
     assert label is not None
     told = [float(each) / 100 for each in re.findall(r"joint\d ([\d.]+)", label)]
-    assert told == pytest.approx(judged["quality"]["coverage"], abs=6e-4)
+    assert told == pytest.approx([each["coverage"] for each in joints], abs=6e-4)
     bars = place.locator(".bars.nmse b").all()
     colours = [each.evaluate("(bar) => getComputedStyle(bar).backgroundColor") for each in bars]
     assert len(set(colours)) == 2, "each joint has its colour"
@@ -70,7 +73,7 @@ def test_card_shows_quality_of_each_joint(visitor: Visitor, judged: dict[str, An
     assert charts[1] is not None
     assert charts[0]["height"] == charts[1]["height"]
     heights = [each.evaluate("(bar) => bar.getBoundingClientRect().height") for each in bars]
-    assert (heights[0] < heights[1]) == (judged["quality"]["nmse"][0] < judged["quality"]["nmse"][1])
+    assert (heights[0] < heights[1]) == (expected[0] < expected[1])
 
 
 def test_card_draws_the_arm_if_one_was_learnt(visitor: Visitor, judged: dict[str, Any]) -> None:

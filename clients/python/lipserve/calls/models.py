@@ -188,10 +188,13 @@ def aliases(_route: Route, model: str) -> Call[list[Alias]]:
 
 
 @route("PUT", "/v1/models/{model}/aliases/{alias}")
-def set_alias(_route: Route, model: str, alias: str, version: int | str) -> Call[Alias]:
-    """Point an alias to a version, or to the version of another alias. `serving` sets the serving version."""
+def set_alias(_route: Route, model: str, alias: str, version: int | str, override: bool = False) -> Call[Alias]:
+    """Point an alias to a version, or to the version of another alias. `serving` sets the serving version.
+
+    override: move it even if the version is not usable by its verdict.
+    """
     body = {"alias": version} if isinstance(version, str) else {"version": version}
-    return _route(record(Alias), names={"model": model, "alias": alias}, json=body)
+    return _route(record(Alias), names={"model": model, "alias": alias}, json={**body, "override": override})
 
 
 @route("DELETE", "/v1/models/{model}/aliases/{alias}")

@@ -62,6 +62,7 @@ class JointLimits(Record, frozen=True, kw_only=True):
 
     range_used: Largest less smallest position, as a share of the joint's range
     speed_used: Largest speed divided by the speed limit
+    torque_limit: Rated torque of the actuator, N·m
     torque_used: Largest torque divided by the torque limit
     beyond_range: Share of samples beyond the position limits
     beyond_speed: Share of samples beyond the speed limit
@@ -71,6 +72,7 @@ class JointLimits(Record, frozen=True, kw_only=True):
     joint: str
     range_used: float | None
     speed_used: float | None
+    torque_limit: float | None = None
     torque_used: float | None
     beyond_range: float | None
     beyond_speed: float | None

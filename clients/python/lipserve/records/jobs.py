@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from lipserve.records import Record
-from lipserve.records.models import HeldOutQuality
+from lipserve.records.models import Verdict
 
 
 class Holdout(Record, frozen=True, kw_only=True):
@@ -98,7 +98,7 @@ class Job(Record, frozen=True, kw_only=True):
     refresh: Refreshed version; null for a job with data sets only
     attempts: Number of starts; more than one after an interruption
     version: Version that the job made; null unless it succeeded
-    quality: Quality of that version on the held-out part; null if nothing was held out
+    verdict: Verdict on that version; null without one
     heartbeat_at: Time of the training process's last heartbeat
     history: State changes, oldest first
     retry_of: Job that this one repeats; null if none
@@ -118,7 +118,7 @@ class Job(Record, frozen=True, kw_only=True):
     progress: JobProgress
     attempts: int
     version: int | None
-    quality: HeldOutQuality | None = None
+    verdict: Verdict | None = None
     error: JobError | None
     created_at: str
     started_at: str | None

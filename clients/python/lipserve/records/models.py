@@ -7,34 +7,74 @@ from typing import Any, Literal
 from lipserve.records import Record
 
 
-class HeldOutQuality(Record, frozen=True, kw_only=True):
-    """Quality of the evaluated fit of a version on the held-out part, per joint; null if torque is constant.
+class JointVerdict(Record, frozen=True, kw_only=True):
+    """Verdict on one joint. Null stands for an unknown value.
 
-    samples: Number of held-out samples
-    nmse: Mean squared error / variance of the measured torque
+    unit: Unit of the torques: N·m, or N for a prismatic joint
+    rmse: Root mean squared error
+    range_share: `rmse` divided by the range of the measured torque
+    limit_share: `rmse` divided by the rated torque of the robot's actuator
+    mean_rmse: Root mean squared error of the mean torque
+    serving_rmse: That of the serving version on the same samples
     coverage: Share of measurements inside the 95 % interval
-    coverage_low: Lower end of the confidence interval of the coverage
+    coverage_low: Lower end of the 95 % confidence interval of the coverage
     coverage_high: Upper end of this confidence interval
+    effective_samples: Effective samples; neighbouring errors are correlated
+    interval_width: Mean width of the 95 % interval
+    width_over_need: This width, relative to that of errors as large as `rmse`
     """
 
-    samples: int
-    nmse: list[float | None]
-    coverage: list[float | None]
-    coverage_low: list[float]
-    coverage_high: list[float]
+    joint: str
+    level: Literal["wrong", "too_uncertain", "not_judged", "usable_in_range", "usable"]
+    unit: str
+    rmse: float
+    range_share: float | None
+    limit_share: float | None
+    mean_rmse: float | None
+    serving_rmse: float | None
+    coverage: float
+    coverage_low: float | None
+    coverage_high: float | None
+    effective_samples: float | None
+    interval_width: float | None
+    width_over_need: float | None
+
+
+class Verdict(Record, frozen=True, kw_only=True):
+    """Verdict on the torque of a version.
+
+    level: `usable`; `usable_in_range`: unknown or wrong outside the recorded range; `not_judged`: too few samples that
+        it has not learnt; `too_uncertain`: intervals no narrower than without a model; `wrong`: errors no smaller than
+        without a model, intervals that are too narrow, or faulty training data
+    serves: Whether a version serves without approval: if it is usable, or usable in range
+    label: The level in words
+    reason: Why, in one sentence
+    action: What to do
+    judged_on: `held_out`: the held-out part of its training; `recording`: another data set; `training`: samples that it
+        has learnt; `nothing`
+    outside: Share of the samples outside the training range; null if unknown
+    repeats: Share of the samples that repeat the training motion; null if unknown
+    """
+
+    level: Literal["wrong", "too_uncertain", "not_judged", "usable_in_range", "usable"]
+    serves: bool
+    label: str
+    reason: str
+    action: str
+    judged_on: Literal["held_out", "recording", "training", "nothing"]
+    outside: float | None
+    repeats: float | None
+    joints: list[JointVerdict]
 
 
 class Promotion(Record, frozen=True, kw_only=True):
-    """Whether a new version became the serving version, and why. The held-out part of its training decides.
+    """Whether a new version became the serving version, and why.
 
     answers: Whether it started to serve after training; else it got the alias `candidate`
-    passed: Whether its error is below that of the mean torque on every joint, coverage is at least 90 %, and it is not
-        worse than the serving version; null if that cannot be determined
     serving: Serving version until then; null if there was none
     """
 
     answers: bool
-    passed: bool | None
     serving: int | None
     reason: str
 
@@ -42,14 +82,13 @@ class Promotion(Record, frozen=True, kw_only=True):
 class VersionSummary(Record, frozen=True, kw_only=True):
     """A version in the list of its model.
 
-    quality: Quality on the held-out part of its training; null if nothing was held out
     promotion: Whether it became the serving version, and why; null for a refreshed or shipped version
     """
 
     version: int
     created_at: str
     estimator: str
-    quality: HeldOutQuality | None = None
+    verdict: Verdict
     promotion: Promotion | None = None
 
 
@@ -164,6 +203,7 @@ class Version(Record, frozen=True, kw_only=True):
     hyperparameters: dict[str, Any]
     warnings: list[str]
     lineage: dict[str, Any]
+    verdict: Verdict
     promotion: Promotion | None = None
     selection: Selection | None = None
     robot: dict[str, Any] | None = None

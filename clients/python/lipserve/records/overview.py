@@ -7,7 +7,7 @@ from typing import Literal
 from lipserve.records import Record
 from lipserve.records.learning import Alarm
 from lipserve.records.live import LivePayload
-from lipserve.records.models import HeldOutQuality
+from lipserve.records.models import Verdict
 
 
 class SketchedJoint(Record, frozen=True, kw_only=True):
@@ -73,7 +73,6 @@ class ModelOverview(Record, frozen=True, kw_only=True):
     serving_version: Serving version; null if all versions are candidates
     estimator: Estimator of the serving version, else of the newest. The following fields are of this version
     created_at: Creation time of the version
-    quality: Quality on the held-out part of its training; null if nothing was held out
     candidate: Version under the alias `candidate`
     arm: Null if the estimator has no arm geometry
     position: Position at the last row that this process received, rad (m); else a posture of its training
@@ -92,7 +91,7 @@ class ModelOverview(Record, frozen=True, kw_only=True):
     created_at: str
     joint_names: list[str]
     joint_types: list[Literal["revolute", "prismatic"]]
-    quality: HeldOutQuality | None
+    verdict: Verdict
     candidate: int | None
     arm: ArmSketch | None
     position: list[float]

@@ -7,6 +7,7 @@ from dataclasses import fields, is_dataclass
 from html import escape
 from typing import Any, TypeVar, get_args
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,6 +49,8 @@ def plain(value: Any) -> Any:
         return plain(value.tolist())
     if isinstance(value, float):
         return None if np.isnan(value) else value
+    if isinstance(value, msgspec.Struct):
+        return msgspec.to_builtins(value)
     if is_dataclass(value) and not isinstance(value, type):
         given = {each.name: getattr(value, each.name) for each in fields(value)}
         return {name: plain(each) for name, each in given.items() if each is not None}

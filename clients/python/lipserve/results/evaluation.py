@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lipserve.records.models import Verdict
 from lipserve.results import Array, Plain, figure, html_table, reading, text_table
 from lipserve.states import Outcome
 from lipserve.wording import percent
@@ -47,6 +48,18 @@ class Stretches(Plain):
     """(S,) compared samples."""
     nmse: Array
     """(n, S) mean squared error in the part / variance of the torque over all samples."""
+
+
+@dataclass(frozen=True, eq=False)
+class OutsideRange(Plain):
+    """Quality on the samples outside the training range; NaN without such samples."""
+
+    share: float
+    """Share of the samples."""
+    squared: Array
+    """(n,) mean squared error, (N·m)²."""
+    coverage: Array
+    """(n,) share of measurements inside the 95 % interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +112,12 @@ class Evaluation(Plain):
     """Period of the training motion, s; None if unknown."""
     warnings: tuple[str, ...]
     """Other reasons why the figures are too optimistic."""
+    verdict: Verdict
+    """Verdict on the version by these figures."""
+    torque_range: Array | None = None
+    """(n,) max less min of the measured torque, N·m; None for versions of earlier releases."""
+    outside: OutsideRange | None = None
+    """Quality outside the training range; None for versions of earlier releases."""
     judged: bool = False
     """Whether the figures are those of the fit without these samples; the version was trained on them afterwards."""
 
@@ -119,11 +138,13 @@ class Evaluation(Plain):
         return f"{self.model} version {self.version} on {self.samples_used} {what} of {self.dataset}{caveat}"
 
     def __str__(self) -> str:
-        return "\n".join([text_table(self.title, self._columns()), *(f"warning: {each}" for each in self.warnings)])
+        verdict = f"{self.verdict.label}: {self.verdict.reason}"
+        warnings = (f"warning: {each}" for each in self.warnings)
+        return "\n".join([text_table(self.title, self._columns()), verdict, *warnings])
 
     def _repr_html_(self) -> str:
-        warnings = (f"<p>warning: {escape(each)}</p>" for each in self.warnings)
-        return html_table(self.title, self._columns()) + "".join(warnings)
+        texts = (f"{self.verdict.label}: {self.verdict.reason}", *(f"warning: {each}" for each in self.warnings))
+        return html_table(self.title, self._columns()) + "".join(f"<p>{escape(each)}</p>" for each in texts)
 
     def _columns(self) -> dict[str, list[str]]:
         heads = {
@@ -155,6 +176,7 @@ class VersionFigures(Plain):
     nlpd: Array
     interval_width: Array
     in_training: bool
+    verdict: Verdict
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,7 +87,7 @@ def assert_ok(answer):
 
 
 def move_request(alias, version):
-    return PUT, f"arm/aliases/{alias}", {"version": version}
+    return PUT, f"arm/aliases/{alias}", {"version": version, "override": True}
 
 
 def import_version(api):

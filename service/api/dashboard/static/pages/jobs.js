@@ -69,7 +69,7 @@ export async function render(view, params, { signal, title }) {
 const COLUMNS = [
   { label: "Model", value: (job) => job.model, cell: (job) => link(job.model, `#/jobs/${job.id}`) },
   { label: "State", value: (job) => job.state, cell: (job) => badge(job.state) },
-  ...qualityColumns((job) => ({ quality: job.quality, joints: null })).map((column) => ({
+  ...qualityColumns((job) => job.verdict).map((column) => ({
     ...column,
     cell: (job) => (job.state === "succeeded" ? column.cell(job) : "–"),
   })),

@@ -1,6 +1,6 @@
 // One model: accuracy, parameters, versions, online learning, and a form for predictions.
 
-import { get, pages, path, put } from "../api.js";
+import { get, pages, path } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
 import { when } from "../format.js";
 import { badge, button, errorBox, heading, link, loading, notice, tabs } from "../ui.js";
@@ -12,9 +12,10 @@ import { chooser, firstChoice } from "./model/choice.js";
 import { learning } from "./model/learning.js";
 import { lineage } from "./model/lineage.js";
 import { parts } from "./model/parts.js";
-import { promotionCheck, promotionNote } from "./model/promotion.js";
-import { confirmServing } from "./model/serving.js";
+import { promotionNote } from "./model/promotion.js";
+import { moveAlias, servingButton } from "./model/serving.js";
 import { versions } from "./model/versions.js";
+import { verdictNote } from "./verdict.js";
 
 /** Tabs: name in the address, label, function that draws it, selects above the tabs that it uses. */
 const TABS = [
@@ -93,14 +94,12 @@ function defaultVersion(model) {
 
 /** Create the header with actions and the shown version. Returns its element and a function that updates it. */
 function header(state, reload) {
-  const { name, where } = state;
+  const { name } = state;
   const promote = button("", async () => {
-    const shown = state.version.version;
-    if (!(await confirmServing(name, state.version, state.model.serving_version))) return;
-    await put(`${where}/aliases/serving`, { version: shown });
-    notice(`Version ${shown} of ${name} is now serving.`);
+    if (!(await moveAlias(state, "serving", state.version))) return;
+    notice(`Version ${state.version.version} of ${name} is now serving.`);
     await reload();
-  }, { kind: "primary" });
+  });
   const actions = h("div", { class: "actions" }), about = h("div", {});
   const follow = link("Follow live", `#/live/${encodeURIComponent(name)}`);
   const train = link("Train a new version", `#/train?model=${encodeURIComponent(name)}`);
@@ -108,13 +107,11 @@ function header(state, reload) {
     const { version, model: { serving_version: serving, aliases } } = state;
     const shown = version.version;
     const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
-    promote.textContent = `Serve version ${shown}`;
-    const { word, kind, why } = promotionCheck(version);
-    promote.title = why;
-    refresh(actions, shown === serving ? badge("serving") : [badge(word, kind), promote], follow, train);
+    [promote.textContent, promote.className] = servingButton(version);
+    refresh(actions, shown === serving ? badge("serving") : promote, follow, train);
     const other = serving === null ? "no version is serving" : `version ${serving} is serving`;
     const answers = shown === serving ? `Version ${shown} is serving` : `Viewing version ${shown} · ${other}`;
-    refresh(about, h("p", { class: "muted" }, [answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")), shown === serving || promotionNote(version)?.matches(".banner") ? promotionNote(version) : h("p", { class: "hint" }, why), warningBanner(version.warnings));
+    refresh(about, h("p", { class: "muted" }, [answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")), verdictNote(version.verdict), promotionNote(version), warningBanner(version.warnings));
   };
   return [h("div", {}, heading(name, actions), about), update];
 }

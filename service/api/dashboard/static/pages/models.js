@@ -22,7 +22,7 @@ export async function render(view, _params, { signal, title }) {
   const serving = (model) => model.versions.find((each) => each.version === model.serving_version);
   const columns = [
     { label: "Model", value: (model) => model.name, cell: (model) => link(model.name, address(model.name)) },
-    ...qualityColumns((model) => ({ quality: serving(model)?.quality, joints: null })),
+    ...qualityColumns((model) => serving(model)?.verdict ?? null),
     { label: "Serving version", value: (model) => model.serving_version, cell: (model) => link(model.serving_version === null ? "none" : `version ${model.serving_version}`, `${address(model.name)}?tab=versions`) },
     { label: "Estimator", value: (model) => serving(model)?.estimator, cell: (model) => serving(model)?.estimator ?? "–" },
     { label: "Created", value: (model) => serving(model)?.created_at, first: "descending", cell: (model) => (serving(model) ? time(serving(model).created_at) : "–") },

@@ -1,24 +1,31 @@
-// Columns with the quality on held-out rows, for tables of models, versions and jobs.
+// Columns with the verdict on a version and its errors on held-out rows, for tables of models, versions and jobs.
 
-import { coverageBars, errorBars, mean } from "../charts.js";
+import { coverageBars, mean } from "../charts.js";
 import { h } from "../dom.js";
-import { nmse, percent, shortNames } from "../format.js";
-import { narrowJoints } from "./model/coverage.js";
+import { percent, shortNames } from "../format.js";
+import { figuresOf, verdictBadge } from "./verdict.js";
 
 /** Explanation of the columns, shown below a table. */
-export const QUALITY_HINT = "nMSE and 95\u00a0% coverage are means over the joints; bars show each joint. Both are evaluated on held-out rows, before the version is trained on all rows. nMSE: lower is better; 1 is no better than the mean torque. Coverage should be near 95\u00a0%; less means that the intervals are too narrow.";
+export const QUALITY_HINT = "Verdict: whether the torque can be used. Error: the largest RMSE of a joint, as a share of the range of its torque. 95\u00a0% coverage: share of the measurements inside the 95\u00a0% interval, mean over the joints. All are evaluated on held-out rows, before the version is trained on all rows.";
 
-/** Return the columns. of(row): {quality, joints}; joints: names, null if unknown. */
+/** Return the columns. of(row): the verdict of the row's version; null without a version. */
 export function qualityColumns(of) {
-  const names = ({ quality, joints }) => (joints ? shortNames(joints) : quality.nmse.map((_each, joint) => `joint ${joint + 1}`));
-  const figure = (row, name, format, bars) => {
-    const { quality, joints } = of(row);
-    if (!quality) return h("span", { class: "muted", title: "No rows were held out of the training" }, "not evaluated");
-    const narrow = name === "coverage" && narrowJoints(quality).length > 0;
-    return h("div", { class: "figure" }, h("span", { class: narrow ? "narrow" : null }, format(mean(quality[name]))), bars(names({ quality, joints }), quality[name]));
+  const coverage = (row) => {
+    const figures = figuresOf(of(row));
+    if (!figures) return "–";
+    return h("div", { class: "figure" }, h("span", {}, percent(mean(figures.coverage), 0)), coverageBars(shortNames(figures.joints), figures.coverage));
+  };
+  const error = (row) => {
+    const shares = (of(row)?.joints ?? []).map((each) => each.range_share).filter((each) => each !== null);
+    return shares.length ? Math.max(...shares) : null;
+  };
+  const reason = (row) => {
+    const verdict = of(row);
+    return verdict ? h("details", { class: "why" }, h("summary", {}, verdictBadge(verdict)), h("p", { class: "hint" }, verdict.reason, " ", verdict.action)) : "–";
   };
   return [
-    { label: "nMSE", value: (row) => mean(of(row).quality?.nmse), cell: (row) => figure(row, "nmse", nmse, errorBars) },
-    { label: "95\u00a0% coverage", value: (row) => mean(of(row).quality?.coverage), cell: (row) => figure(row, "coverage", (x) => percent(x, 0), coverageBars) },
+    { label: "Verdict", value: (row) => of(row)?.label ?? null, cell: reason },
+    { label: "Error", value: error, cell: (row) => (error(row) === null ? "–" : percent(error(row), 1)) },
+    { label: "95\u00a0% coverage", value: (row) => mean(figuresOf(of(row))?.coverage), cell: coverage },
   ];
 }

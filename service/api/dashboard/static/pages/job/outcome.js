@@ -6,10 +6,11 @@ import { h, replace } from "../../dom.js";
 import { count, nmse, number, percent, shortNames } from "../../format.js";
 import { card, link, table } from "../../ui.js";
 import { warningBanner } from "../data/prose.js";
-import { coverageInterval, narrowJoints } from "../model/coverage.js";
+import { coverageInterval } from "../model/coverage.js";
 import { learningCurveCard } from "../model/learning_curve.js";
 import { promotionNote } from "../model/promotion.js";
 import { selectionCard } from "../model/selection.js";
+import { verdictNote } from "../verdict.js";
 import { HELD_OUT_NOTE } from "./words.js";
 
 const ADVICE = {
@@ -45,11 +46,12 @@ async function versionResult(job, signal) {
   const made = card(
     "Result",
     h("p", {}, more, servingNote(job, version)),
+    verdictNote(version.verdict),
     promotionNote(version),
     warningBanner([...version.warnings, ...(held?.warnings ?? [])]),
     held?.nmse
       ? [figures(`On ${count(held.samples)} held-out samples`, held, version), held.learnt ? h("p", { class: "hint" }, HELD_OUT_NOTE) : null]
-      : h("p", { class: "banner" }, "Nothing was held out, so the quality is unknown. Evaluate the version on a recording that it was not trained on."),
+      : null,
     !held?.nmse && trained?.nmse ? figures(`On ${count(trained.samples)} training samples: these figures are optimistic`, trained, version) : null,
   );
   return [made, selectionCard(version), learningCurveCard(version)];
@@ -62,23 +64,7 @@ function servingNote(job, { promotion }) {
 
 function figures(caption, found, version) {
   const names = shortNames(version.joint_names);
-  return [problemBanner(found, names), h("div", { class: "charts wide" }, qualityCharts(names, found)), figuresTable(caption, found, names, version.joint_types)];
-}
-
-/** Return a banner with problems of the figures; null if there are none. */
-function problemBanner(found, names) {
-  const joints = names.map((name, index) => ({ name, nmse: found.nmse[index] }));
-  const narrow = narrowJoints(found);
-  const useless = joints.filter((each) => each.nmse !== null && each.nmse >= 1);
-  const problems = [];
-  if (narrow.length) {
-    const which = narrow.map((joint) => `${names[joint]} (${percent(found.coverage[joint], 0)})`).join(", ");
-    problems.push(`The 95 % intervals are too narrow on ${which}: the model is overconfident.`);
-  }
-  if (useless.length) {
-    problems.push(`On ${useless.map((each) => each.name).join(", ")}, predictions are no better than a constant torque (nMSE ≥ 1).`);
-  }
-  return problems.length ? h("div", { class: "banner" }, problems.map((text) => h("p", {}, text))) : null;
+  return [h("div", { class: "charts wide" }, qualityCharts(names, found)), figuresTable(caption, found, names, version.joint_types)];
 }
 
 function figuresTable(caption, found, names, types) {

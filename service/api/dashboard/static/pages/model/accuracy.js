@@ -5,7 +5,7 @@ import { h, replace } from "../../dom.js";
 import { card, loading } from "../../ui.js";
 import { boxes, figures, reliability } from "./figures.js";
 import { noData } from "./choice.js";
-import { coverageCard } from "./coverage.js";
+import { verdictCard } from "./coverage.js";
 import { intervalArea, lineWithGaps, column, measurementStd } from "./curves.js";
 import { trainingDataNotes } from "./training_data.js";
 import { jointPlots } from "./joints.js";
@@ -58,7 +58,7 @@ export async function accuracy(view, state, { signal }) {
   });
   const evaluation = await evaluated;
   if (signal.aborted) return;
-  replace(table, coverageCard(evaluation));
+  replace(table, verdictCard(evaluation));
   replace(all, figures(evaluation));
   await boxes(spread, evaluation, signal);
   await reliability(reliable, evaluation, signal);

@@ -8,6 +8,7 @@ import { badge, button, card, errorBox, field, loading, select, table } from "..
 import { compatible, noData, trainingRole } from "./choice.js";
 import { lineWithGaps, column } from "./curves.js";
 import { jointPlots } from "./joints.js";
+import { verdictBadge } from "../verdict.js";
 
 const BADGE_KINDS = { no_difference: "plain", cannot_tell: "warn" };
 const MAX_VERSIONS = 4, POINTS = 1000;
@@ -97,6 +98,7 @@ function figures(comparisons) {
   const figure = (values, format, bars) => h("div", { class: "figure" }, h("span", {}, format(mean(values))), bars(names, values));
   const columns = [
     { label: "Version", cell: (row) => [h("i", { class: "swatch", style: `background: var(--version-${rows.indexOf(row) + 1})` }), ` ${row.version}`, row.in_training ? h("span", { class: "hint" }, " trained on this recording: optimistic") : null] },
+    { label: "Verdict", cell: (row) => verdictBadge(row.verdict) },
     { label: "nMSE", cell: (row) => figure(row.nmse, nmse, errorBars) },
     { label: "95\u00a0% coverage", cell: (row) => figure(row.coverage, (x) => percent(x, 0), coverageBars) },
     { label: "NLPD, nats", numeric: true, cell: (row) => number(mean(row.nlpd)) },

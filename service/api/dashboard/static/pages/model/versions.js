@@ -1,6 +1,6 @@
 // Versions and aliases: serve, roll back, export, delete, compare.
 
-import { del, get, path, post, put } from "../../api.js";
+import { del, get, path, post } from "../../api.js";
 import { h, replace } from "../../dom.js";
 import { ago, when } from "../../format.js";
 import { listing } from "../../tables.js";
@@ -8,8 +8,7 @@ import { badge, button, card, confirm, field, loading, notice, select, table } f
 import { QUALITY_HINT, qualityColumns } from "../quality.js";
 import { compareForm } from "./compare.js";
 import { exportVersion } from "./export.js";
-import { promotionCheck } from "./promotion.js";
-import { confirmServing } from "./serving.js";
+import { moveAlias, servingButton } from "./serving.js";
 
 /** Draw the tab. */
 export async function versions(view, state, { signal, reload, select: viewVersion }) {
@@ -29,11 +28,9 @@ function versionTable({ name, where, model, version }, aliases, reload, viewVers
   const actions = (each) => {
     const number = each.version;
     const made = [button("View", () => viewVersion(number, "accuracy"))];
-    if (number !== serving) made.push(button("Serve", async () => {
-      if (!(await confirmServing(name, each, serving))) return;
-      await put(`${where}/aliases/serving`, { version: number });
-      await reloadAndNotify(reload, `Version ${number} of ${name} is now serving.`);
-    }, { kind: "primary" }));
+    if (number !== serving) made.push(button(each.verdict.serves ? "Serve" : "Serve anyway", async () => {
+      if (await moveAlias({ name, where, model }, "serving", each)) await reloadAndNotify(reload, `Version ${number} of ${name} is now serving.`);
+    }, { kind: servingButton(each)[1] }));
     made.push(button("Export", () => exportVersion(name, number)));
     if (number !== serving && !named(number).length) made.push(button("Delete", async () => {
       if (!(await confirm(`Delete version ${number} of ${name}? This cannot be undone.`, `Delete version ${number}`))) return;
@@ -56,8 +53,7 @@ function versionTable({ name, where, model, version }, aliases, reload, viewVers
         each.version === version.version ? h("span", { class: "muted" }, "viewing") : null,
       ],
     },
-    ...qualityColumns((each) => ({ quality: each.quality, joints: version.joint_names })),
-    { label: "Held-out check", value: (each) => promotionCheck(each).word, cell: checkCell },
+    ...qualityColumns((each) => each.verdict),
     { label: "Estimator", value: (each) => each.estimator, cell: (each) => each.estimator },
     { label: "Created", value: (each) => each.created_at, first: "descending", cell: (each) => h("time", { datetime: each.created_at, title: when(each.created_at) }, ago(each.created_at)) },
     { label: "Actions", cell: actions },
@@ -66,16 +62,11 @@ function versionTable({ name, where, model, version }, aliases, reload, viewVers
     caption: "Versions, newest first",
     what: ["version", "versions"],
     key: (each) => each.version,
-    words: (each) => [`version ${each.version}`, each.estimator, promotionCheck(each).word, ...named(each.version)].join(" "),
+    words: (each) => [`version ${each.version}`, each.estimator, each.verdict.label, ...named(each.version)].join(" "),
     minRows: 4,
   });
   list.show([...model.versions].reverse());
   return [list.element, h("p", { class: "hint" }, QUALITY_HINT)];
-}
-
-function checkCell(version) {
-  const { word, kind, why } = promotionCheck(version);
-  return h("details", { class: "why" }, h("summary", {}, badge(word, kind)), h("p", { class: "hint" }, why));
 }
 
 function aliasTable({ name, where }, aliases, reload) {
@@ -112,9 +103,7 @@ function aliasForm({ where, model, name }, reload) {
   const set = button("Set alias", async () => {
     if (!alias.reportValidity()) return;
     const chosen = alias.value.trim(), number = Number(version.value);
-    if (chosen === "serving" && !(await confirmServing(name, model.versions.find((each) => each.version === number), model.serving_version))) return;
-    await put(`${where}/aliases/${encodeURIComponent(chosen)}`, { version: number });
-    await reloadAndNotify(reload, `${chosen} → version ${number}`);
+    if (await moveAlias({ name, where, model }, chosen, model.versions.find((each) => each.version === number))) await reloadAndNotify(reload, `${chosen} → version ${number}`);
   });
   return h(
     "details",

@@ -1,8 +1,7 @@
 // Queued and running jobs with their progress, and the last finished ones.
 
-import { mean } from "../../charts.js";
 import { h, refresh } from "../../dom.js";
-import { ago, nmse, percent, seconds } from "../../format.js";
+import { ago, seconds } from "../../format.js";
 import { badge, card, link, progress } from "../../ui.js";
 
 const MAX_FINISHED = 3;
@@ -28,10 +27,6 @@ function status(job) {
   const { stage, remaining_s: left } = job.progress;
   if (job.state === "queued") return `queued ${ago(job.created_at)}`;
   if (job.state === "running") return left ? `${stage}, up to ${seconds(left)} left` : stage;
-  if (job.state === "succeeded") return `version ${job.version}${qualityText(job)}, ${ago(job.finished_at)}`;
+  if (job.state === "succeeded") return `version ${job.version}${job.verdict ? `: ${job.verdict.label}` : ""}, ${ago(job.finished_at)}`;
   return `${job.error?.message ?? ""} ${ago(job.finished_at)}`.trim();
-}
-
-function qualityText({ quality }) {
-  return quality ? `: nMSE ${nmse(mean(quality.nmse))}, 95\u00a0% coverage ${percent(mean(quality.coverage), 0)}` : "";
 }

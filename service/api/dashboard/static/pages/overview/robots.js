@@ -5,6 +5,7 @@ import { h, refresh } from "../../dom.js";
 import { ago, kilograms, seconds, shortNames } from "../../format.js";
 import { badge, link } from "../../ui.js";
 import { chain, sketch } from "../arm/sketch.js";
+import { figuresOf, verdictBadge } from "../verdict.js";
 
 const NEW_MS = 86_400_000;
 const BUCKETS = 60; // points of the last hour
@@ -58,7 +59,7 @@ function robotCard(first) {
   const update = (model, live) => {
     const names = shortNames(model.joint_names);
     refresh(state, streamState(model, live));
-    refresh(about, model.serving_version === null ? "No version is serving; all are candidates." : `Version ${model.serving_version}, ${model.estimator}, created ${ago(model.created_at)}.`, model.candidate ? ` Version ${model.candidate} is a candidate.` : "");
+    refresh(about, model.serving_version === null ? "No version is serving; all are candidates. " : [verdictBadge(model.verdict), ` Version ${model.serving_version}, ${model.estimator}, created ${ago(model.created_at)}.`], model.candidate ? ` Version ${model.candidate} is a candidate.` : "");
     if (drawn !== model.serving_version) {
       drawn = model.serving_version;
       posture = JSON.stringify(model.position);
@@ -71,7 +72,7 @@ function robotCard(first) {
       posture = JSON.stringify(model.position);
       arm?.glide(model.position);
     }
-    body.classList.toggle("unjudged", !model.quality && !model.recent?.rows);
+    body.classList.toggle("unjudged", !figuresOf(model.verdict) && !model.recent?.rows);
     refresh(charts, qualityParts(model, names));
     refresh(lastHour, recentInnovation(model, names));
     refresh(news, newsItems(model, address));
@@ -86,7 +87,8 @@ function streamState(model, live) {
   return h("span", { class: "hint" }, model.idle_s === null ? "no stream yet" : `idle for ${seconds(Math.round(model.idle_s))}`);
 }
 
-function qualityParts({ quality: judged, recent }, names) {
+function qualityParts({ verdict, recent }, names) {
+  const judged = figuresOf(verdict);
   const lastHour = recent?.rows ? recent : null;
   if (!judged && !lastHour) return h("p", { class: "hint" }, "Not evaluated: no rows were held out, and no stream was received.");
   const note = judged && lastHour ? "Bars: held-out rows. Lines: last hour." : judged ? "On held-out rows." : "In the last hour.";

@@ -1,0 +1,336 @@
+"""The verdict on a model: whether its torque can be used, by its figures on samples that it has not learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from scipy.special import fdtri
+
+from lipcore.data import repetition
+from lipcore.data.coverage import clopper_pearson
+from lipcore.data.metrics import LEVEL, quantile
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array
+from lipcore.data.splits import Mask
+from lipcore.model import texts
+from lipcore.model.torque_model import TrainingRange
+from lipcore.vocabulary import JointType
+
+Level = Literal["wrong", "too_uncertain", "not_judged", "usable_in_range", "usable"]
+LEVELS: Final[tuple[Level, ...]] = ("wrong", "too_uncertain", "not_judged", "usable_in_range", "usable")
+"""Levels of a verdict, the worst first."""
+SERVING_LEVELS: Final[tuple[Level, ...]] = ("usable_in_range", "usable")
+"""Levels at which a version serves without approval."""
+JudgedOn = Literal["held_out", "recording", "training", "nothing"]
+"""Samples behind a verdict: held-out part, another recording, the training data, or no samples."""
+
+
+@dataclass(frozen=True)
+class VerdictOptions:
+    """Thresholds of a verdict."""
+
+    max_error: float = 0.9
+    """Max mean squared error, as a share of that of the mean torque. The margin is a tenth."""
+    min_coverage: float = 0.9
+    """Min coverage of the 95 % intervals, within sampling error."""
+    max_width: float = 1.0
+    """Max width of the 95 % intervals, as a share of that of the mean torque, 2 · 1.96 · its standard deviation."""
+    min_signal: float = 3.0
+    """Min standard deviation of a measured torque, relative to its noise, that a model must explain."""
+    confidence: float = 0.95
+    """Probability that the error of a joint is below `max_error`."""
+    min_outside: float = 10.0
+    """Min effective samples outside the training range for a verdict on motion outside it."""
+
+
+OPTIONS = VerdictOptions()
+BEYOND: Final = 0.1
+"""A state is outside the training range if a quantity of a joint is beyond it by this share of the range."""
+
+
+def is_outside(motion: Motion, known: TrainingRange) -> Mask:
+    """Return which of N states are outside a training range, (N,), see `BEYOND`."""
+    out = np.zeros(len(motion.q), np.bool_)
+    for name, values in (("q", motion.q), ("dq", motion.dq), ("ddq", motion.ddq)):
+        low, high = (np.array(known[name][end]) for end in ("min", "max"))
+        margin = BEYOND * (high - low)
+        out |= ((values < low - margin) | (values > high + margin)).any(axis=1)
+    return out
+
+
+@dataclass(frozen=True)
+class OutsideFigures:
+    """Figures on the samples outside the training range, (n,) each."""
+
+    share: float
+    """Share of the samples."""
+    squared: Array
+    """Mean squared error, (N·m)² (N²); NaN without such samples."""
+    coverage: Array
+    """Coverage of the 95 % intervals; NaN without such samples."""
+
+
+@dataclass(frozen=True)
+class JudgedFigures:
+    """Figures of a model on samples, (n,) each. NaN stands for an unknown value."""
+
+    joint_names: tuple[str, ...]
+    joint_types: tuple[JointType, ...]
+    nmse: Array
+    """Squared error divided by the variance of the measured torque; NaN if it does not vary."""
+    rmse: Array
+    """Root mean square error, N·m (N)."""
+    torque_noise: Array
+    """White noise of the measured torque, N·m (N), see `lipcore.data.signals.noise_level`."""
+    coverage: Array
+    """Coverage of the 95 % intervals."""
+    coverage_low: Array
+    """Lower end of the confidence interval of the coverage."""
+    coverage_high: Array
+    """Upper end of this interval."""
+    independent: Array
+    """Number of effective samples."""
+    interval_width: Array
+    """Mean width of the 95 % intervals, N·m (N)."""
+    torque_range: Array
+    """Max less min of the measured torque, N·m (N)."""
+    torque_limit: Array
+    """Rated torque of the actuator, N·m (N)."""
+    serving_rmse: Array
+    """Root mean square error of the serving version on the same samples, N·m (N)."""
+    outside: OutsideFigures | None
+    """None if the training range is unknown."""
+
+    @property
+    def mean_rmse(self) -> Array:
+        """Root mean square error of the mean torque, N·m (N): NaN if the torque does not vary."""
+        return np.asarray(self.rmse / np.sqrt(np.where(self.nmse > 0, self.nmse, np.nan)))
+
+    @property
+    def width_over_need(self) -> Array:
+        """Width of the intervals, relative to that of errors of the same root mean square; NaN without errors."""
+        return np.asarray(self.interval_width / np.where(self.rmse > 0, 2 * quantile(LEVEL) * self.rmse, np.nan))
+
+
+@dataclass(frozen=True)
+class JointVerdict:
+    """The verdict on a joint; torques in N·m, of prismatic joints in N. None stands for an unknown value."""
+
+    joint: str
+    level: Level
+    unit: str
+    rmse: float
+    range_share: float | None
+    limit_share: float | None
+    mean_rmse: float | None
+    serving_rmse: float | None
+    coverage: float
+    coverage_low: float | None
+    coverage_high: float | None
+    effective_samples: float | None
+    interval_width: float | None
+    width_over_need: float | None
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on a model: its level, why, and what to do."""
+
+    level: Level
+    reason: str
+    """Why, in one sentence."""
+    action: str
+    """The one thing to do."""
+    judged_on: JudgedOn
+    joints: tuple[JointVerdict, ...] = ()
+    outside: float | None = None
+    """Share of the samples outside the training range; None if unknown."""
+    repeats: float | None = None
+    """Share of the samples that repeat the training motion; None if unknown."""
+
+    @property
+    def serves(self) -> bool:
+        """Whether a version with this verdict may serve without approval."""
+        return self.level in SERVING_LEVELS
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of a recording, such as an inverted torque: what it is, and what to do."""
+
+    text: str
+    action: str
+
+
+def judge(
+    figures: JudgedFigures | None,
+    judged_on: JudgedOn,
+    repeats: float | None = None,
+    faults: Sequence[Fault] = (),
+    faulty_samples: Sequence[Fault] = (),
+    options: VerdictOptions = OPTIONS,
+) -> Verdict:
+    """Return the verdict on a model.
+
+    Args:
+        figures: Its figures on samples; None without samples.
+        judged_on: The origin of the samples.
+        repeats: Share of the samples that repeat the training motion; None if unknown.
+        faults: Faults of its training data, the gravest first. With any, it is wrong, whatever its figures.
+        faulty_samples: Faults of the samples. With any, it is not judged.
+        options: Thresholds.
+
+    Example:
+        >>> two = {name: np.full(2, np.nan) for name in ("torque_range", "torque_limit", "serving_rmse")}
+        >>> two |= {"nmse": np.array([0.01, 0.98]), "rmse": np.array([0.1, 1.0]), "torque_noise": np.full(2, 0.05)}
+        >>> two |= {name: np.full(2, 0.95) for name in ("coverage", "coverage_low", "coverage_high")}
+        >>> two |= {"independent": np.full(2, 60.0), "interval_width": np.full(2, 4.0)}
+        >>> figures = JudgedFigures(("hip", "knee"), ("revolute", "revolute"), **two, outside=None)
+        >>> judge(figures, "held_out").reason
+        'The errors are no smaller than with the mean torque: knee 1 N·m RMSE (mean torque: 1 N·m).'
+
+    """
+    if figures is None:
+        found = Verdict("not_judged", texts.NOTHING_HELD_OUT, texts.HOLD_OUT, "nothing")
+    else:
+        found = _Judging(figures, judged_on, repeats, options).verdict()
+    causes: tuple[tuple[Level, Sequence[Fault]], ...] = (("wrong", faults), ("not_judged", faulty_samples))
+    for level, which in causes:
+        if which:
+            return replace(found, level=level, reason=which[0].text, action=which[0].action)
+    return found
+
+
+@dataclass(frozen=True)
+class _Judging:
+    """Checks of figures; each returns a mask of the joints, (n,)."""
+
+    figures: JudgedFigures
+    judged_on: JudgedOn
+    repeats: float | None
+    options: VerdictOptions
+
+    def verdict(self) -> Verdict:
+        figures = self.figures
+        large, few, narrow, wide = self.has_large_error(), self.has_few_samples(), self.is_narrow(), self.is_wide()
+        checks: list[tuple[Level, Mask, str, str]] = [
+            ("wrong", large, texts.describe_large_error(self._list(large, self._errors())), texts.CHECK_TORQUE),
+            ("wrong", narrow, texts.describe_narrow(self._list(narrow, self._coverages())), texts.RECORD_VARIED),
+            ("too_uncertain", wide, texts.describe_wide(self._list(wide, self._widths())), texts.RECORD_MORE),
+            ("not_judged", few, texts.describe_few_samples(self._list(few, self._counts())), texts.RECORD_LONGER),
+        ]
+        everywhere = np.ones(len(figures.nmse), np.bool_)
+        if self.judged_on == "training":
+            checks.append(("not_judged", everywhere, texts.JUDGED_ON_TRAINING, texts.EVALUATE_OTHER))
+        if not self.has_signal().any():
+            checks.append(("not_judged", everywhere, texts.NO_SIGNAL, texts.RECORD_FASTER))
+        if (inside := self.why_only_inside()) is not None:
+            checks.append(("usable_in_range", everywhere, inside, texts.STAY_INSIDE))
+        checks.append(("usable", everywhere, texts.describe_usable(self._best()), texts.NOTHING_TO_DO))
+        level, _, reason, action = next(each for each in checks if each[1].any())
+        joints: list[Level] = [next(each[0] for each in checks if each[1][j]) for j in range(len(everywhere))]
+        outside = None if figures.outside is None else figures.outside.share
+        return Verdict(level, reason, action, self.judged_on, self._joints(joints), outside, self.repeats)
+
+    def has_signal(self) -> Mask:
+        """Return the joints whose torque is larger than its noise."""
+        spread = np.nan_to_num(self.figures.mean_rmse)
+        return np.asarray((spread > 0) & (spread >= self.options.min_signal * self.figures.torque_noise))
+
+    def has_large_error(self) -> Mask:
+        """Return the joints with an error that is not below that of the mean torque."""
+        return np.asarray(self.has_signal() & (self.figures.nmse >= self.options.max_error))
+
+    def has_few_samples(self) -> Mask:
+        """Return the joints with too few samples to tell whether the error is below that of the mean torque.
+
+        Both errors are of N effective samples each. With probability `confidence`, their ratio is below `nmse` times
+        the quantile of F(N, N).
+        """
+        count = np.maximum(self.figures.independent, 1.0)
+        bound = self.figures.nmse * fdtri(count, count, self.options.confidence)
+        return np.asarray(self.has_signal() & ~self.has_large_error() & (bound >= self.options.max_error))
+
+    def is_narrow(self) -> Mask:
+        """Return the joints with a coverage below `min_coverage`, beyond sampling error."""
+        return np.asarray(self.figures.coverage_high < self.options.min_coverage)
+
+    def is_wide(self) -> Mask:
+        """Return the joints with intervals that are no narrower than those of the mean torque."""
+        mean_width = 2 * quantile(LEVEL) * self.figures.mean_rmse
+        return np.asarray(self.has_signal() & (self.figures.interval_width >= self.options.max_width * mean_width))
+
+    def why_only_inside(self) -> str | None:
+        """Return why the model is not known to be right outside the training range; None if it is."""
+        if self.repeats is not None and self.repeats >= repetition.OPTIONS.repeated_share:
+            return texts.describe_repeated(self.repeats)
+        outside = self.figures.outside
+        if outside is None:
+            return texts.UNKNOWN_RANGE
+        count = outside.share * self.figures.independent
+        if count.min() < self.options.min_outside:
+            return texts.describe_few_outside(outside.share)
+        large = self.has_signal() & (outside.squared >= self.options.max_error * self.figures.mean_rmse**2)
+        narrow = clopper_pearson(outside.coverage, count)[1] < self.options.min_coverage
+        if (large | narrow).any():
+            return texts.describe_worse_outside(self._list(large | narrow, [""] * len(count)))
+        return None
+
+    def _joints(self, levels: Sequence[Level]) -> tuple[JointVerdict, ...]:
+        f = self.figures
+        return tuple(
+            JointVerdict(
+                joint=f.joint_names[j],
+                level=level,
+                unit=self._unit(j),
+                rmse=float(f.rmse[j]),
+                range_share=_known(f.rmse[j] / f.torque_range[j]) if f.torque_range[j] > 0 else None,
+                limit_share=_known(f.rmse[j] / f.torque_limit[j]),
+                mean_rmse=_known(f.mean_rmse[j]),
+                serving_rmse=_known(f.serving_rmse[j]),
+                coverage=float(f.coverage[j]),
+                coverage_low=_known(f.coverage_low[j]),
+                coverage_high=_known(f.coverage_high[j]),
+                effective_samples=_known(f.independent[j]),
+                interval_width=_known(f.interval_width[j]),
+                width_over_need=_known(f.width_over_need[j]),
+            )
+            for j, level in enumerate(levels)
+        )
+
+    def _unit(self, joint: int) -> str:
+        return "N" if self.figures.joint_types[joint] == "prismatic" else "N·m"
+
+    def _errors(self) -> list[str]:
+        each = zip(self.figures.rmse, self.figures.mean_rmse, strict=True)
+        return [texts.describe_joint_error(rmse, mean, self._unit(j)) for j, (rmse, mean) in enumerate(each)]
+
+    def _coverages(self) -> list[str]:
+        f = self.figures
+        each = zip(f.coverage, f.coverage_low, f.coverage_high, f.independent, strict=True)
+        return [texts.describe_joint_coverage(*joint) for joint in each]
+
+    def _widths(self) -> list[str]:
+        need = 2 * quantile(LEVEL) * self.figures.mean_rmse
+        each = zip(self.figures.interval_width, need, strict=True)
+        return [texts.describe_joint_width(width, mean, self._unit(j)) for j, (width, mean) in enumerate(each)]
+
+    def _counts(self) -> list[str]:
+        return [f"{count:.0f}" for count in self.figures.independent]
+
+    def _best(self) -> str:
+        """Return the range of errors and of coverage over the joints."""
+        shares = self.figures.rmse / np.where(self.figures.torque_range > 0, self.figures.torque_range, np.nan)
+        largest = float(np.nanmax(shares)) if np.isfinite(shares).any() else None
+        return texts.describe_best(largest, float(self.figures.coverage.min()))
+
+    def _list(self, which: Mask, joints: Sequence[str]) -> str:
+        listed = zip(self.figures.joint_names, joints, which, strict=True)
+        return texts.list_joints([f"{name} {text}".strip() for name, text, taken in listed if taken])
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
