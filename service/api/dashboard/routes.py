@@ -27,6 +27,7 @@ def install(app: FastAPI) -> None:
     """Add the dashboard to an application. Its files need no API key; its pages ask for one if the API needs it."""
     app.add_api_route("/", page, include_in_schema=False)
     plotly.install(app, HEADERS)
+    app.mount("/dashboard/libraries", StaticPages(plotly.BUNDLES, HEADERS))
     app.mount("/dashboard", StaticPages(STATIC, HEADERS))
 
 

@@ -14,6 +14,7 @@ from tests.service.data import error
 
 FILES = sorted(path.relative_to(STATIC).as_posix() for path in STATIC.rglob("*") if path.is_file())
 SCRIPTS = {file: (STATIC / file).read_text() for file in FILES if file.endswith(".js")}
+LIBRARIES = "/dashboard/libraries/"
 KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 
 
@@ -46,13 +47,25 @@ def test_imported_names_are_exported_and_used():
     """A browser would report this only when it opens the page."""
     taken = re.compile(r"""import\s*\{([^}]*)\}\s*from\s*["']([^"']+)["']""")
     given = re.compile(r"export\s+(?:async\s+)?(?:function\*?|const|let|class)\s+(\w+)")
+    listed = re.compile(r"export\s*\{([^}]*)\}")
     for file, text in SCRIPTS.items():
         for names, other in taken.findall(text):
-            exported = set(given.findall(((STATIC / file).parent / other).read_text()))
+            if other.startswith(LIBRARIES):
+                continue
+            there = ((STATIC / file).parent / other).read_text()
+            exported = {*given.findall(there), *re.findall(r"\w+", " ".join(listed.findall(there)))}
             for each in filter(None, (name.strip() for name in names.split(","))):
                 name, _, alias = each.partition(" as ")
                 assert name in exported, (file, other, name)
                 assert len(re.findall(rf"\b{alias or name}\b", text)) > 1, (file, name, "is not used")
+
+
+def test_libraries_are_those_of_the_build():
+    """The build downloads them, and browsers ask for them by version."""
+    built = (Path(__file__).parents[3] / "hatch_build.py").read_text()
+    used = {name for text in SCRIPTS.values() for name in re.findall(rf'"{LIBRARIES}([^"]+)"', text)}
+    assert used
+    assert [name for name in used if f'"{name}"' not in built] == []
 
 
 def test_no_module_parses_html():

@@ -1,51 +1,54 @@
-// All models: their serving version and its quality.
+// All models: their serving version, its verdict and errors.
 
 import { pages } from "../api.js";
-import { h, replace } from "../dom.js";
+import { Await, Card, Empty, Heading, Link, Listing, page, useRead } from "../components.js";
 import { ago, count, when } from "../format.js";
-import { listing } from "../tables.js";
-import { card, empty, heading, link } from "../ui.js";
-import { QUALITY_HINT, qualityColumns } from "./quality.js";
+import { html, useEffect } from "../preact.js";
+import { VERDICT_HINT, verdictColumns } from "../verdicts.js";
 
 const MAX_MODELS = 500;
+const COLUMNS = [
+  { label: "Model", value: (model) => model.name, cell: ({ name }) => html`<${Link} to=${address(name)}>${name}<//>` },
+  ...verdictColumns((model) => serving(model)?.verdict ?? null),
+  { label: "Serving version", value: (model) => model.serving_version, cell: ({ name, serving_version: version }) => html`<${Link} to=${`${address(name)}?tab=versions`}>${version === null ? "none" : `version ${version}`}<//>` },
+  { label: "Estimator", value: (model) => serving(model)?.estimator, cell: (model) => serving(model)?.estimator ?? "–" },
+  { label: "Created", value: (model) => serving(model)?.created_at, first: "descending", cell: (model) => time(serving(model)?.created_at) },
+  { label: "Versions", numeric: true, value: (model) => model.versions.length, first: "descending", cell: (model) => count(model.versions.length) },
+  { label: "Aliases", cell: (model) => aliases(model.aliases) },
+  { label: "Live", cell: ({ name }) => html`<${Link} to=${`#/live/${encodeURIComponent(name)}`} label=${`Follow ${name} live`}>follow<//>` },
+];
 
-/** The page `#/models`. */
-export async function render(view, _params, { signal, title }) {
-  title("Models");
-  const models = await pages("/v1/models", MAX_MODELS, {}, signal);
-  const train = link("Train a model", "#/train", "primary");
-  if (!models.length) {
-    const hint = "No models yet. Upload a recording of your robot, then train a model on it. This takes minutes.";
-    replace(view, heading("Models"), empty(hint, link("Upload a recording", "#/data", "primary"), link("Train a model", "#/train")));
-    return;
-  }
-  const serving = (model) => model.versions.find((each) => each.version === model.serving_version);
-  const columns = [
-    { label: "Model", value: (model) => model.name, cell: (model) => link(model.name, address(model.name)) },
-    ...qualityColumns((model) => serving(model)?.verdict ?? null),
-    { label: "Serving version", value: (model) => model.serving_version, cell: (model) => link(model.serving_version === null ? "none" : `version ${model.serving_version}`, `${address(model.name)}?tab=versions`) },
-    { label: "Estimator", value: (model) => serving(model)?.estimator, cell: (model) => serving(model)?.estimator ?? "–" },
-    { label: "Created", value: (model) => serving(model)?.created_at, first: "descending", cell: (model) => (serving(model) ? time(serving(model).created_at) : "–") },
-    { label: "Versions", numeric: true, value: (model) => model.versions.length, first: "descending", cell: (model) => count(model.versions.length) },
-    { label: "Aliases", cell: (model) => aliases(model.aliases) },
-    { label: "Live", cell: (model) => h("a", { href: `#/live/${encodeURIComponent(model.name)}`, "aria-label": `Follow ${model.name} live` }, "follow") },
-  ];
-  const list = listing(columns, {
-    caption: "Models",
-    what: ["model", "models"],
-    key: (model) => model.name,
-    words: (model) => [model.name, serving(model)?.estimator, aliases(model.aliases)].join(" "),
-  });
-  list.show(models);
-  replace(
-    view,
-    heading("Models", train),
-    card("All models", list.element, h("p", { class: "hint" }, QUALITY_HINT), models.length === MAX_MODELS ? h("p", { class: "hint" }, `Showing the newest ${MAX_MODELS} models.`) : null),
-  );
+function Models({ title }) {
+  useEffect(() => title("Models"), []);
+  const models = useRead((signal) => pages("/v1/models", MAX_MODELS, {}, signal), []);
+  return html`<${Await} reading=${models}>${(found) => (found.length ? html`<${List} models=${found} />` : html`<${None} />`)}<//>`;
+}
+
+function List({ models }) {
+  const words = (model) => [model.name, serving(model)?.estimator, serving(model)?.verdict.label, aliases(model.aliases)].join(" ");
+  return html`
+    <${Heading} text="Models"><${Link} to="#/train" kind="primary">Train a model<//><//>
+    <${Card} title="All models">
+      <${Listing} columns=${COLUMNS} rows=${models} caption="Models" what=${["model", "models"]} identity=${(model) => model.name} words=${words} />
+      <p class="hint">${VERDICT_HINT}</p>
+      ${models.length === MAX_MODELS && html`<p class="hint">Showing the newest ${MAX_MODELS} models.</p>`}
+    <//>`;
+}
+
+function None() {
+  return html`
+    <${Heading} text="Models" />
+    <${Empty} text="No models yet. Upload a recording of your robot, then train a model on it. This takes minutes.">
+      <${Link} to="#/data" kind="primary">Upload a recording<//><${Link} to="#/train">Train a model<//>
+    <//>`;
+}
+
+function serving(model) {
+  return model.versions.find((each) => each.version === model.serving_version);
 }
 
 function time(at) {
-  return h("time", { datetime: at, title: when(at) }, ago(at));
+  return at ? html`<time datetime=${at} title=${when(at)}>${ago(at)}</time>` : "–";
 }
 
 function address(name) {
@@ -53,6 +56,7 @@ function address(name) {
 }
 
 function aliases(named) {
-  const found = Object.entries(named);
-  return found.length ? found.map(([alias, version]) => `${alias} → ${version}`).join(", ") : "–";
+  return Object.entries(named).map(([alias, version]) => `${alias} → ${version}`).join(", ") || "–";
 }
+
+export const render = page(Models);
