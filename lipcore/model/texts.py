@@ -115,6 +115,7 @@ JUDGED_ON_TRAINING = "It was trained on these samples, so its errors on other mo
 EVALUATE_OTHER = "Evaluate its held-out part or another recording."
 NO_SIGNAL = "The torque of these samples is not larger than its noise, so the errors say nothing."
 RECORD_FASTER = "Record faster and wider motion."
+JUDGED_AT_REST = "Its errors in motion are unknown: the samples stand still."
 UNKNOWN_RANGE = "Its errors outside the recorded range are unknown."
 CHECK_TORQUE = "Check sign, unit and order of the torque, then record more varied motion and train again."
 RECORD_VARIED = "Record more varied motion and train again."
@@ -158,6 +159,11 @@ def describe_joint_width(width: float, mean: float, unit: str) -> str:
 def describe_few_samples(joints: str) -> str:
     """Return that too few samples are there to compare the error with that of the mean torque."""
     return f"Too few effective samples to judge the errors: {joints}."
+
+
+def describe_short(seconds: float, least: float) -> str:
+    """Return that the samples are too short to judge a model."""
+    return f"Only {seconds:.2g} s can be judged, at least {least:g} s are needed."
 
 
 def describe_repeated(share: float) -> str:

@@ -43,10 +43,14 @@ class VerdictOptions:
     confidence: float = 0.95
     """Probability that the error of a joint is below `max_error`."""
     min_outside: float = 10.0
-    """Min effective samples outside the training range for a verdict on motion outside it."""
+    """Min effective samples in motion for a verdict on motion, and outside the training range for one there."""
+    min_seconds: float = 3.0
+    """Min duration of the samples, s: 30 % of the shortest recording without a warning in its report."""
 
 
 OPTIONS = VerdictOptions()
+MOVING_SPEED: Final = 0.02
+"""A joint moves above this speed, rad/s (m/s)."""
 BEYOND: Final = 0.1
 """A state is outside the training range if a quantity of a joint is beyond it by this share of the range."""
 
@@ -103,6 +107,10 @@ class JudgedFigures:
     """Root mean square error of the serving version on the same samples, N·m (N)."""
     outside: OutsideFigures | None
     """None if the training range is unknown."""
+    moving: float | None
+    """Share of the samples in which a joint moves; None if unknown."""
+    seconds: float | None
+    """Duration of the samples, s; None if unknown."""
 
     @property
     def mean_rmse(self) -> Array:
@@ -188,7 +196,8 @@ def judge(
         >>> two |= {"nmse": np.array([0.01, 0.98]), "rmse": np.array([0.1, 1.0]), "torque_noise": np.full(2, 0.05)}
         >>> two |= {name: np.full(2, 0.95) for name in ("coverage", "coverage_low", "coverage_high")}
         >>> two |= {"independent": np.full(2, 60.0), "interval_width": np.full(2, 4.0)}
-        >>> figures = JudgedFigures(("hip", "knee"), ("revolute", "revolute"), **two, outside=None)
+        >>> known = {"outside": None, "moving": 1.0, "seconds": 60.0}
+        >>> figures = JudgedFigures(("hip", "knee"), ("revolute", "revolute"), **two, **known)
         >>> judge(figures, "held_out").reason
         'The errors are no smaller than with the mean torque: knee 1 N·m RMSE (mean torque: 1 N·m).'
 
@@ -223,6 +232,9 @@ class _Judging:
             ("not_judged", few, texts.describe_few_samples(self._list(few, self._counts())), texts.RECORD_LONGER),
         ]
         everywhere = np.ones(len(figures.nmse), np.bool_)
+        if figures.seconds is not None and figures.seconds < self.options.min_seconds:
+            short = texts.describe_short(figures.seconds, self.options.min_seconds)
+            checks.append(("not_judged", everywhere, short, texts.RECORD_LONGER))
         if self.judged_on == "training":
             checks.append(("not_judged", everywhere, texts.JUDGED_ON_TRAINING, texts.EVALUATE_OTHER))
         if not self.has_signal().any():
@@ -267,7 +279,9 @@ class _Judging:
         """Return why the model is not known to be right outside the training range; None if it is."""
         if self.repeats is not None and self.repeats >= repetition.OPTIONS.repeated_share:
             return texts.describe_repeated(self.repeats)
-        outside = self.figures.outside
+        moving, outside = self.figures.moving, self.figures.outside
+        if moving is not None and moving * self.figures.independent.min() < self.options.min_outside:
+            return texts.JUDGED_AT_REST
         if outside is None:
             return texts.UNKNOWN_RANGE
         count = outside.share * self.figures.independent

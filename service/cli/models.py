@@ -358,7 +358,8 @@ def print_of_joints(version: VersionRecord) -> None:
         "zero_": "zero position in degrees (mm)",
     }
     for prefix, text in joints.items():
-        found = {int(key.removeprefix(prefix)): value for key, value in version.fit.items() if key.startswith(prefix)}
+        numbered = ((key.removeprefix(prefix), value) for key, value in version.fit.items() if key.startswith(prefix))
+        found = {int(number): value for number, value in numbered if number.isdecimal()}  # not `local_nats`
         if found:
             echo(f"  {text}: {', '.join(f'{version.joint_names[j - 1]} {found[j]:.2g}' for j in sorted(found))}")
 

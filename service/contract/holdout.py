@@ -138,6 +138,10 @@ class Evaluation(BaseModel):
     coverage_high: list[float] = Field(
         description="Upper end of this confidence interval. If it is below 0.9, intervals are too narrow"
     )
+    seconds: float | None = Field(None, description="Duration of the samples, s; null for versions of earlier releases")
+    moving: float | None = Field(
+        None, description="Share of samples in which a joint moves; null for versions of earlier releases"
+    )
     torque_range: list[float] | None = Field(
         None, description="Max less min of the measured torque, N·m; null for versions of earlier releases"
     )

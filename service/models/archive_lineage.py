@@ -51,6 +51,8 @@ class JudgedFigures(Figures):
     """Figures that a verdict needs."""
 
     torque_noise: list[Size] | None = None
+    seconds: Size | None = None
+    moving: Share | None = None
     torque_range: list[Size] | None = None
     torque_limit: list[Size | None] | None = None
     outside: OutsideRange | None = None

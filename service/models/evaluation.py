@@ -12,7 +12,7 @@ from lipcore.data.coverage import CoverageInterval, coverage_interval
 from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics, TorqueDistribution
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TrainingRange
-from lipcore.model.verdict import is_outside
+from lipcore.model.verdict import MOVING_SPEED, is_outside
 from service.contract.holdout import Interval, Reliability, Stretches
 from service.foundation.fields import finite
 
@@ -52,7 +52,10 @@ def range_figures(samples: Samples, answer: TorqueDistribution, known: TrainingR
     figures = {"squared": squared, "coverage": answer.contains(samples.tau)[outside]}
     means = {name: values.mean(axis=0).tolist() if len(values) else None for name, values in figures.items()}
     unknown = [None] * samples.n_joints
+    steps = np.diff(samples.t)
     return {
+        "seconds": len(samples) * float(np.median(steps[steps > 0])) if (steps > 0).any() else None,
+        "moving": float((np.abs(samples.dq) > MOVING_SPEED).any(axis=1).mean()),
         "torque_range": np.ptp(samples.tau, axis=0).tolist(),
         "outside": {"share": float(outside.mean()), **{name: each or unknown for name, each in means.items()}},
     }

@@ -92,6 +92,8 @@ def read_figures(
             torque_noise=np.nan_to_num(column("torque_noise")),
             serving_rmse=np.full(n, np.nan) if not serving else np.array(serving["rmse"], np.float64),
             outside=None if outside is None else _outside(outside),
+            moving=record.get("moving"),
+            seconds=record.get("seconds"),
             **columns,
         )
     except (KeyError, TypeError, ValueError):

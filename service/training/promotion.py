@@ -19,6 +19,7 @@ from lipcore.data.samples import Samples
 from lipcore.estimators.base import RobotKind
 from lipcore.files.manifest import ModelFormatError
 from lipcore.model.torque_model import TorqueModel
+from lipcore.model.verdict import OPTIONS
 from service.contract.holdout import HoldoutLineage
 from service.contract.models import Promotion
 from service.contract.states import PromotionOption
@@ -105,8 +106,25 @@ def _against(
         return ServingComparison(True, texts.describe_learnt_held_out(name))
     if len(scores.rows) < 2:
         return ServingComparison(True, texts.describe_too_short(name), rmse)
+    if foreign := _find_foreign_joints(serving, trained, held_out, rmse):
+        return ServingComparison(False, texts.describe_foreign_recording(name, foreign), rmse)
     serves, reason = _compare(scores.difference_from(before), name)
     return ServingComparison(serves, reason, rmse)
+
+
+def _find_foreign_joints(
+    serving: VersionRow, trained: TorqueModel, held_out: Samples, rmse: list[float] | None
+) -> list[str]:
+    """Return the joints on which a usable serving version is no better than the mean torque, unlike the new version.
+
+    The recording is then of another robot, or with another payload or torque unit.
+    """
+    if rmse is None or not verdicts.of_version(serving.manifest).serves:
+        return []
+    limit = np.sqrt(OPTIONS.max_error) * held_out.tau.std(axis=0)
+    own = np.sqrt(np.mean((held_out.tau - answer_of(trained, held_out).mean) ** 2, axis=0))
+    foreign = (np.array(rmse) >= limit) & (own < limit)
+    return [name for name, is_foreign in zip(trained.joint_names, foreign, strict=True) if is_foreign]
 
 
 def _scores(

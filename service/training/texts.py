@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 TAKEN_BACK = "observations that it was trained on have been unlearnt or rolled back meanwhile: refresh again"
 CANCELLED_WAITING = "cancelled while waiting"
 CANCELLED_RUNNING = "cancelled while running"
@@ -89,6 +91,14 @@ def describe_changed_serving(serving: int) -> str:
 def describe_other_robot(name: str) -> str:
     """State that the serving version is of another robot."""
     return f"{_start(name)} is of another robot."
+
+
+def describe_foreign_recording(name: str, joints: Sequence[str]) -> str:
+    """State that the serving version does not describe a recording at all."""
+    return (
+        f"On this recording, the errors of {name} are no smaller than with the mean torque ({', '.join(joints)}). Is "
+        "it the same robot, with the same payload and torque unit?"
+    )
 
 
 def describe_unreadable(name: str) -> str:

@@ -30,7 +30,12 @@ EVALUATION = {
     **{"coverage": [0.94, 1.0], "nlpd": [-1.5, 0.125], "interval_width": [2.0, 1.0], "in_training": True},
     **{"independent": [12.4, 8.0], "coverage_low": [0.6, 0.63], "coverage_high": [1.0, 1.0]},
     **{"repeats_training": 0.97, "period_s": 5.0, "warnings": ["97 % repeat: <flatters>"], "judged": False},
-    **{"torque_range": [4.0, 2.0], "outside": {"share": 0.25, "squared": [0.5, 0.1], "coverage": [0.9, 1.0]}},
+    **{
+        "seconds": 5.0,
+        "moving": 1.0,
+        "torque_range": [4.0, 2.0],
+        "outside": {"share": 0.25, "squared": [0.5, 0.1], "coverage": [0.9, 1.0]},
+    },
     "verdict": UNJUDGED,
     "coverages": [{"level": 0.5, "coverage": [0.5, 0.6], "interval_width": [0.7, 0.4]}],
     "reliability": {"nominal": [0.5, 0.9], "observed": [[0.5, 0.9], [0.6, 0.95]]},

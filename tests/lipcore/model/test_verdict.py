@@ -28,6 +28,8 @@ GOOD = JudgedFigures(
     torque_limit=np.array([20.0, np.nan]),
     serving_rmse=np.array([0.2, np.nan]),
     outside=OUTSIDE,
+    moving=1.0,
+    seconds=30.0,
 )
 
 
@@ -65,6 +67,9 @@ CASES = {
         "usable_in_range",
         "1 % of the samples",
     ),
+    "short": (replace(GOOD, seconds=2.9), "not_judged", "Only 2.9 s can be judged, at least 3 s are needed."),
+    "at rest": (replace(GOOD, moving=0.1), "usable_in_range", "the samples stand still"),
+    "earlier release": (replace(GOOD, moving=None, seconds=None), "usable", "coverage"),
     "unknown range": (replace(GOOD, outside=None), "usable_in_range", "outside the recorded range are unknown"),
     "large outside": (
         replace(GOOD, outside=replace(OUTSIDE, squared=np.array([0.02, 4.6]))),
@@ -167,5 +172,7 @@ def test_mean_and_shuffled_torque_are_never_usable(seed):
             interval_width=9 * one,
             **dict.fromkeys(("torque_range", "torque_limit", "serving_rmse"), unknown),
             outside=None,
+            moving=1.0,
+            seconds=60.0,
         )
         assert not judge(figures, "held_out").serves

@@ -114,6 +114,10 @@ class Evaluation(Plain):
     """Other reasons why the figures are too optimistic."""
     verdict: Verdict
     """Verdict on the version by these figures."""
+    seconds: float | None = None
+    """Duration of the samples, s; None for versions of earlier releases."""
+    moving: float | None = None
+    """Share of samples in which a joint moves; None for versions of earlier releases."""
     torque_range: Array | None = None
     """(n,) max less min of the measured torque, N·m; None for versions of earlier releases."""
     outside: OutsideRange | None = None
