@@ -171,9 +171,10 @@ def describe_repeated(share: float) -> str:
     return f"The errors are known only on repeated motion: {100 * share:.0f} % of the samples repeat the training."
 
 
-def describe_few_outside(share: float) -> str:
-    """Return that too few samples are outside the training range."""
-    return f"Its errors outside the recorded range are unknown: {100 * share:.0f} % of the samples were outside it."
+def describe_few_outside(share: float, count: float) -> str:
+    """Return that too few samples are outside the training range. count: effective samples there."""
+    amount = f"{100 * share:.0f} % of the samples, {count:.0f} effective ones"
+    return f"Its errors outside the recorded range are unknown: too few samples were outside it ({amount})."
 
 
 def describe_worse_outside(joints: str) -> str:

@@ -43,7 +43,9 @@ class VerdictOptions:
     confidence: float = 0.95
     """Probability that the error of a joint is below `max_error`."""
     min_outside: float = 10.0
-    """Min effective samples in motion for a verdict on motion, and outside the training range for one there."""
+    """Min effective samples outside the training range for a verdict on motion there."""
+    min_moving: float = 0.1
+    """Min share of the samples in motion for a verdict on motion."""
     min_seconds: float = 3.0
     """Min duration of the samples, s: 30 % of the shortest recording without a warning in its report."""
 
@@ -280,13 +282,13 @@ class _Judging:
         if self.repeats is not None and self.repeats >= repetition.OPTIONS.repeated_share:
             return texts.describe_repeated(self.repeats)
         moving, outside = self.figures.moving, self.figures.outside
-        if moving is not None and moving * self.figures.independent.min() < self.options.min_outside:
+        if moving is not None and moving < self.options.min_moving:
             return texts.JUDGED_AT_REST
         if outside is None:
             return texts.UNKNOWN_RANGE
         count = outside.share * self.figures.independent
         if count.min() < self.options.min_outside:
-            return texts.describe_few_outside(outside.share)
+            return texts.describe_few_outside(outside.share, float(count.min()))
         large = self.has_signal() & (outside.squared >= self.options.max_error * self.figures.mean_rmse**2)
         narrow = clopper_pearson(outside.coverage, count)[1] < self.options.min_coverage
         if (large | narrow).any():

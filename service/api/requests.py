@@ -27,6 +27,8 @@ MONITORING = frozenset(
 )
 QUIET = frozenset({f"{_OF_CALLS}ModelInfer"})
 """gRPC routes of control loops."""
+READING = frozenset({"GET", "HEAD"})
+"""Methods of requests that only read."""
 
 
 def telemetry(settings: Settings) -> TelemetryConfig:
@@ -57,8 +59,8 @@ MAX_REFUSALS_PER_S = 10
 class RequestLog:
     """The request log: one line per request, with two exceptions.
 
-    - Requests of control loops (`quiet`) and of monitoring are logged only if they fail or take `slow_s` or longer: a
-      log line takes longer than their answer.
+    - Requests that only read (GET), of control loops (`quiet`) and of monitoring are logged only if they fail or take
+      `slow_s` or longer: pages and clients poll, and a log line takes longer than the answer to a control loop.
     - Of equal refusals, `max_refusals` a second are logged and the others counted, so that a control loop with wrong
       requests does not fill the disk.
     """
@@ -67,9 +69,12 @@ class RequestLog:
         self.quiet, self.slow_s, self.max_refusals = frozenset(quiet) | QUIET | MONITORING, slow_s, max_refusals
         self._refusals: dict[tuple[str, int, str], tuple[int, int]] = {}  # the current second and the number in it
 
-    def may_log(self, route: str, seconds: float) -> bool:
+    def may_log(self, method: str, route: str, seconds: float) -> bool:
         """Return whether a successful request may be logged: a quick check before `log_end`."""
-        return route not in self.quiet or seconds >= self.slow_s or request_lines.isEnabledFor(logging.DEBUG)
+        return not self._is_quiet(method, route) or seconds >= self.slow_s or request_lines.isEnabledFor(logging.DEBUG)
+
+    def _is_quiet(self, method: str, route: str) -> bool:
+        return method in READING or route in self.quiet
 
     def log_end(self, scope: Scope, kind: Kind, seconds: float) -> None:
         """Log an answered request or the end of a stream."""
@@ -77,7 +82,7 @@ class RequestLog:
         if kind.status >= 400:
             level, missed = logging.INFO if kind.status < 500 else logging.WARNING, self._count_skipped(kind)
         else:
-            level = logging.DEBUG if kind.route in self.quiet and not slow else logging.INFO
+            level = logging.DEBUG if self._is_quiet(kind.method, kind.route) and not slow else logging.INFO
         if missed < 0 or not request_lines.isEnabledFor(level):
             return
         fields: dict[str, Any] = {"status": kind.status, "duration_ms": round(seconds * 1e3, 3)}
@@ -175,7 +180,7 @@ class RequestContext:
             if durations is None:
                 durations = self.requests.find(Kind(*kind), status < 400 or _exists(scope, model))
             durations.add(answered - began)
-            if status >= 400 or self.log.may_log(path, seconds):
+            if status >= 400 or self.log.may_log(method, path, seconds):
                 self.log.log_end(scope, Kind(*kind), seconds)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, error: Exception, begun: bool) -> None:

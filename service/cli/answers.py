@@ -15,7 +15,7 @@ from lipserve.call import given
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, out, print_json, print_warnings
 from service.cli.models import print_verdict
-from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
+from service.cli.options import Data, Json, ModelVersion, Url, alone, group, names, numbers
 from service.foundation.text import counted
 
 predict_app = alone()
@@ -23,7 +23,7 @@ predict_app = alone()
 
 @predict_app.command()
 def predict(
-    model: Model,
+    model: ModelVersion,
     q: Annotated[str, typer.Option("--q", help="Positions, rad, separated by commas.")],
     dq: Annotated[str | None, typer.Option("--dq", help="Velocities, rad/s. Default: zero.")] = None,
     ddq: Annotated[str | None, typer.Option("--ddq", help="Accelerations, rad/s². Default: zero.")] = None,
@@ -43,8 +43,6 @@ def predict(
         str | None,
         typer.Option(help="Payload inertia xx,xy,xz,yy,yz,zz about its centre of mass, kg·m². Default: a point mass."),
     ] = None,
-    version: Version = None,
-    alias: Alias = None,
     min_revision: Annotated[
         int | None,
         typer.Option(min=0, help="Min revision of the answer, to include acknowledged observations."),
@@ -69,8 +67,6 @@ def predict(
             position,
             velocity,
             acceleration,
-            version=version,
-            alias=alias,
             components=names(components) or [],
             tau=torque,
             min_revision=min_revision,
@@ -111,11 +107,9 @@ evaluate_app = alone()
 
 @evaluate_app.command()
 def evaluate(
-    model: Model,
+    model: ModelVersion,
     data: Data,
     url: Url = DEFAULT_URL,
-    version: Version = None,
-    alias: Alias = None,
     robot: Annotated[
         str | None,
         typer.Option(help="Robot of a recording to upload: profile such as panda, or id of an uploaded URDF."),
@@ -128,7 +122,7 @@ def evaluate(
     """Evaluate a model on a recording, joint by joint. On training data, the figures are too optimistic."""
     with connected(url) as client:
         dataset = dataset_of(client, data, **given(robot=robot))
-        answer = client.evaluate(model, dataset, version, alias, "held_out" if held_out else "all")
+        answer = client.evaluate(model, dataset, part="held_out" if held_out else "all")
     if as_json:
         print_json(answer)
         return
@@ -144,7 +138,7 @@ WARM_UP = 20
 
 @bench_app.command()
 def latency(
-    model: Model,
+    model: ModelVersion,
     queries: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of queries for each transport.")] = 2000,
     url: Url = DEFAULT_URL,
     as_json: Json = False,

@@ -136,13 +136,14 @@ def train(
     robot: Annotated[
         str | None,
         typer.Option(
-            help="Robot for rigid-body estimators: a profile such as panda, the id of a URDF, or a .urdf file."
+            help="Robot for rigid-body estimators: a profile such as panda, the id of a URDF, a .urdf file, or none. "
+            "Default: the robot of the recordings."
         ),
     ] = None,
     base: Annotated[
         str | None,
         typer.Option(
-            help="Version of another unit of the same robot to start from, for rigid-body estimators: MODEL:3, "
+            help="Version of another unit of the same robot to start from, for rigid-body estimators: MODEL@3, "
             "MODEL@ALIAS or MODEL.",
             autocompletion=connecting.models,
         ),
@@ -191,7 +192,7 @@ def train(
         "estimator": estimator,
         "joint_types": names(joint_types),
         "options": options or None,
-        "robot": robot if urdf is None else None,
+        "robot": False if robot == "none" else robot if urdf is None else None,
         "holdout": _holdout(hold_out, hold_out_by, hold_out_only),
         "base": base,
         "promotion": promotion,

@@ -15,12 +15,13 @@ from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
-from service.cli.options import Alias, Data, Json, Limit, Model, Promotion, Url, Version, Yes, confirm, group
+from service.cli.options import Data, Json, Limit, Model, ModelVersion, Promotion, Url, Yes, confirm, group
 from service.cli.wording import in_shell
 from service.foundation.text import counted
 
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
+    from lipserve.records.models import Model as ModelRecord
     from lipserve.records.models import Selection, Verdict
     from lipserve.results.arm import Version as VersionRecord
     from service.contract.states import PromotionOption
@@ -64,16 +65,18 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 
 
 @app.command()
-def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+def show(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Print a model with its versions, and details of one version (default: the serving version)."""
     from lipserve import ApiError  # noqa: PLC0415 - slow import, not needed for help
+    from lipserve.call import split_name  # noqa: PLC0415 - as above
     from service.cli.tables import verdict_cells  # noqa: PLC0415 - as above
 
     with connected(url) as client:
-        record = client.model(model)
-        detail = client.version(model, version or record.serving_version or record.latest_version)
+        name, which = split_name(model)
+        record = client.model(name)
+        detail = client.version(name, _number(record, **which))
         try:
-            learning = client.learning(model).status
+            learning = client.learning(name).status
         except ApiError:  # the serving version cannot be read; show the others
             learning = None
     if as_json:
@@ -132,7 +135,10 @@ def rollback(
             return
         back = client.rollback(model, revision=revision)
     print_result(
-        back, as_json, f"{model} is back at revision {revision}: {counted(back.undone, 'batch', 'batches')} undone"
+        back,
+        as_json,
+        f"{counted(back.undone, 'batch', 'batches')} undone that {model} learnt after revision {revision}; the result "
+        f"is revision {back.revision}",
     )
 
 
@@ -192,7 +198,7 @@ def compare(
 
 @app.command("export")
 def export_(
-    model: Model,
+    model: ModelVersion,
     path: Annotated[Path | None, typer.Argument(help="Archive to write, .tar.", dir_okay=False)] = None,
     c: Annotated[
         Path | None,
@@ -200,8 +206,6 @@ def export_(
             "--c", help="Write C code for control loops instead: folder for lipserve_model.c and .h.", file_okay=False
         ),
     ] = None,
-    version: Version = None,
-    alias: Alias = None,
     learnt: Annotated[
         bool, typer.Option(help="Include what was learnt online, or export the version as trained.")
     ] = True,
@@ -218,14 +222,14 @@ def export_(
         raise CommandError("give an archive to write or --c FOLDER" + ("" if c is None else ", not both"))
     if c is not None:
         with connected(url) as client:
-            client.export(model, c, version, alias, learnt, format="c")
+            client.export(model, c, learnt=learnt, format="c")
         source, header = c / "lipserve_model.c", c / "lipserve_model.h"
         text = f"{source} and {header}: {source.stat().st_size:,} bytes; `cc -O2 -c {source}` compiles it"
         print_result({"source": source, "header": header}, as_json, text)
         return
     assert path is not None
     with connected(url) as client:
-        written = client.export(model, path, version, alias, learnt)
+        written = client.export(model, path, learnt=learnt)
     size = written.stat().st_size
     print_result(
         {"file": written, "bytes": size},
@@ -235,12 +239,10 @@ def export_(
 
 
 @app.command()
-def urdf(
-    model: Model, version: Version = None, alias: Alias = None, url: Url = DEFAULT_URL, as_json: Json = False
-) -> None:
+def urdf(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Print the estimated arm of a version as a URDF: `lipserve models urdf NAME > arm.urdf`."""
     with connected(url) as client:
-        text = client.urdf(model, version, alias)
+        text = client.urdf(model)
     if as_json:
         print_json({"urdf": text})
     else:
@@ -291,6 +293,17 @@ def delete(
         else:
             client.delete_version(model, version)
     print_result({"deleted": {"model": model, "version": version}}, as_json, f"{what} deleted")
+
+
+def _number(record: ModelRecord, version: int | None = None, alias: str | None = None) -> int:
+    """Return the number of a version; raise CommandError for an unknown alias."""
+    if alias in (None, SERVING):
+        return version or record.serving_version or record.latest_version
+    if alias not in record.aliases:
+        raise CommandError(
+            f"{record.name} has no alias {alias!r}", f"its aliases: {', '.join(record.aliases) or 'none'}"
+        )
+    return record.aliases[alias]
 
 
 def _which(text: str) -> int | str:

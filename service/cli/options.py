@@ -48,10 +48,14 @@ Data = Annotated[
     str,
     typer.Argument(help="Recording to upload, or id or name of a data set.", autocompletion=connecting.datasets),
 ]
-Version = Annotated[
-    int | None, typer.Option(help="Version number. Default: the serving version.", autocompletion=connecting.versions)
+ModelVersion = Annotated[
+    str,
+    typer.Argument(
+        metavar="MODEL[@VERSION]",
+        help="Name of the model, with @3 or @ALIAS for another version than the serving one.",
+        autocompletion=connecting.models,
+    ),
 ]
-Alias = Annotated[str | None, typer.Option(help="Alias of the version to use.", autocompletion=connecting.aliases)]
 
 
 def simulation(help_: str, *names: str, **limits: Any) -> Any:

@@ -15,7 +15,6 @@ from service.cli.connecting import connected
 from service.cli.consoles import INTERRUPTED, CommandError, Explained, echo, note, out, print_error, print_json
 from service.cli.options import (
     ROBOTS,
-    Alias,
     Along,
     Coulomb,
     DirtShare,
@@ -24,13 +23,12 @@ from service.cli.options import (
     Json,
     Mass,
     MassAt,
-    Model,
+    ModelVersion,
     Noise,
     Range,
     Seed,
     Sinusoids,
     Url,
-    Version,
     Viscous,
     alone,
     simulation,
@@ -46,7 +44,7 @@ app = alone()
 
 @app.command()
 def stream(
-    model: Model,
+    model: ModelVersion,
     file: Annotated[
         Path | None,
         typer.Argument(help="Recording with times, q and tau; dq and ddq are derived if they are missing."),
@@ -80,8 +78,6 @@ def stream(
     stream_id: Annotated[
         str | None, typer.Option(help="Name of the stream that the torques belong to. Default: a new name.")
     ] = None,
-    version: Version = None,
-    alias: Alias = None,
     rate: Annotated[float, simulation("Sample rate, Hz.", min=1, max=2000)] = 100.0,
     seed: Seed = 0,
     sinusoids: Sinusoids = 50,
@@ -123,12 +119,12 @@ def stream(
     with (
         Stop().listening() as stop,
         connected(url) as client,
-        client.stream(model, version=version, alias=alias, stream_id=source, scale=True, timeout=10.0) as opened,
+        client.stream(model, stream_id=source, scale=True, timeout=10.0) as opened,
     ):
         played = _fitting(played, opened)
         step = played.step if deadline is None else deadline / 1e3
         _announce(played, opened, source)
-        misfit = MisfitMonitor(client, model, source, yes_learn)
+        misfit = MisfitMonitor(client, opened.hello.model, source, yes_learn)
 
         def each_second(second: int, part: Tally) -> None:
             _print_second(second, part, opened, learn, as_json)

@@ -106,12 +106,13 @@ class JobRequest(BaseModel):
     robot: str | None = Field(
         None,
         max_length=40,
-        description=f"For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}: a profile such as panda, or the id of a URDF",
+        description=f"For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}: a profile such as panda, or the id of a URDF. By "
+        "default the robot of the data sets, if it has a URDF with their joints; null: none",
     )
     base: str | None = Field(
         None,
         pattern=VERSION,
-        description="Version of another unit of the same robot to start from: `model:3`, `model@alias`, or `model` for "
+        description="Version of another unit of the same robot to start from: `model@3`, `model@alias`, or `model` for "
         f"the serving version. For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}. Its arm is the prior, its friction is "
         f"not. "
         "It can be deleted after the job",

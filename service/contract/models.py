@@ -14,8 +14,8 @@ ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
 VersionNumber = Annotated[int, Field(ge=1, lt=2**31)]
 ALIAS = r"^[a-z][a-z0-9._-]{0,63}$"
-VERSION = r"^[a-z0-9][a-z0-9._-]{0,63}(:[1-9][0-9]{0,8}|@[a-z][a-z0-9._-]{0,63})?$"
-"""A version in one text: `model:3`, `model@alias`, or `model` for the serving version."""
+VERSION = r"^[a-z0-9][a-z0-9._-]{0,63}([:@][1-9][0-9]{0,8}|@[a-z][a-z0-9._-]{0,63})?$"
+"""A version in one text: `model@3`, `model@alias`, or `model` for the serving version. Jobs keep it as `model:3`."""
 AliasName = Annotated[str, StringConstraints(pattern=ALIAS)]
 """A letter, then lower-case letters, digits, dots, underscores and hyphens: never a version number."""
 

@@ -272,8 +272,8 @@ def find(database: Database, model: str, version: int | None) -> VersionRow:
 
 def find_named(database: Database, text: str) -> VersionRow:
     """Return the version for a text of the pattern `schema.VERSION`; raise NotFoundError or NoServingVersionError."""
-    name, _, alias = text.partition("@")
-    model, _, number = name.partition(":")
+    model, _, which = text.replace(":", "@").partition("@")
+    number, alias = (which, "") if which.isdecimal() else ("", which)
     if alias in ("", SERVING):
         return find(database, model, int(number) if number else None)
     version = pointers(database, [model]).get((model, alias))

@@ -59,6 +59,7 @@ def create(
     if (before := done_before(queue.database, named)) is not None:
         return before
     rows, joint_types, base = _checked(queue, request)
+    request = _with_default_robot(queue.database, request, rows, joint_types)
     queue.storage.disk.require()  # room for the new version
     with queue.database.transaction() as session:
         if (
@@ -81,6 +82,25 @@ def create(
             raise not_found("robot", request.robot)
     queue.submit(job.id)
     return represent(job)
+
+
+def _with_default_robot(
+    database: Database, request: JobRequest, rows: Sequence[DatasetRow], joint_types: Sequence[str]
+) -> JobRequest:
+    """Return a request with the robot of its data sets, unless it names one or null, or its estimator uses none.
+
+    A robot without a usable URDF is not used: such data sets only have its limits.
+    """
+    # of an uploaded URDF, the report has only the name
+    known = {(row.report.get("upload_options") or {}).get("robot") or row.report.get("robot") for row in rows}
+    uses_robot = request.base is None and request.estimator in (AUTO, *ROBOT_ESTIMATORS)
+    if "robot" in request.model_fields_set or not uses_robot or len(known) != 1 or (robot := known.pop()) is None:
+        return request
+    try:
+        robots.resolve(database, robot, rows[0].joint_names, joint_types)
+    except (ValueError, extras.MissingExtraError):
+        return request
+    return request.model_copy(update={"robot": robot})
 
 
 def check(queue: JobQueue, draft: JobDraft) -> None:

@@ -25,8 +25,15 @@ MAX_ENTRIES = 100
 """Maximum entries of a job. A waiting job may see any number of service restarts."""
 
 
+logger = logging.getLogger(__name__)
+
+
 def enter(row: JobRow, state: JobState, message: str) -> None:
-    """Set a job's state and add an entry with time and reason. An end is stamped; a waiting job has no progress."""
+    """Set a job's state, add an entry with time and reason, and log it: three lines for a job that runs undisturbed.
+
+    An end is stamped; a waiting job has no progress.
+    """
+    logger.info("%s of %s: %s", row.id, row.model, message)
     at = now()
     entries = [*(row.history or []), {"at": at, "state": state, "message": message}]
     # keep the first entry, which says how the job was queued, and the newest others
@@ -168,9 +175,6 @@ class WatchedJob:
         if clock - self.ran >= settings.max_job_s:
             return JobEnd(self.job, "too_long", texts.describe_too_long(settings.max_job_s))
         return None
-
-
-logger = logging.getLogger(__name__)
 
 
 def new_folder(job: str) -> str:

@@ -181,6 +181,29 @@ def given(**values: Any) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
+def split_name(model: str, version: int | None = None, alias: str | None = None) -> tuple[str, dict[str, Any]]:
+    """Return the name of a model, and its version or alias as fields of a request.
+
+    Args:
+        model: `NAME`, `NAME@3` or `NAME@ALIAS`.
+        version: Version number.
+        alias: Alias.
+
+    Raises:
+        ValueError: The name has a version or an alias, and another one is given.
+
+    Example:
+        >>> split_name("my-arm@production")
+        ('my-arm', {'alias': 'production'})
+    """
+    name, at, which = model.partition("@")
+    if not at:
+        return model, given(version=version, alias=alias)
+    if version is not None or alias is not None:
+        raise ValueError(f"{model!r} names a version already: omit `version` and `alias`.")
+    return name, {"version": int(which)} if which.isdecimal() else {"alias": which}
+
+
 _RESULT = re.compile(r"Call\[(?:Page\[(?P<item>.+)\]|(?P<one>.+))\]")
 
 

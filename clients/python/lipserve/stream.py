@@ -18,6 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import connect
 
 from lipserve.address import Address, headers_of, url_of
+from lipserve.call import split_name
 from lipserve.exchange import (
     Exchange,
     StreamAnswer,
@@ -74,7 +75,8 @@ class _Stream(StreamSide):
         self.timeout, self._url = timeout, address.base
         self._unix = address.unix if unix is None else Path(unix)
         self._exchange = Exchange(stream_id, first_sequence)
-        query = {"version": version, "alias": alias, "stream_id": stream_id}
+        model, which = split_name(model, version, alias)
+        query = {**which, "stream_id": stream_id}
         flags = {"scale": scale, "payload": payload, "rich": rich}
         query |= {name: 1 if wanted else None for name, wanted in flags.items()}
         self._destination = destination(address.base, model, **query)

@@ -68,7 +68,7 @@ CASES = {
         "1 % of the samples",
     ),
     "short": (replace(GOOD, seconds=2.9), "not_judged", "Only 2.9 s can be judged, at least 3 s are needed."),
-    "at rest": (replace(GOOD, moving=0.1), "usable_in_range", "the samples stand still"),
+    "at rest": (replace(GOOD, moving=0.09), "usable_in_range", "the samples stand still"),
     "earlier release": (replace(GOOD, moving=None, seconds=None), "usable", "coverage"),
     "unknown range": (replace(GOOD, outside=None), "usable_in_range", "outside the recorded range are unknown"),
     "large outside": (

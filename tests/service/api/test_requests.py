@@ -194,16 +194,23 @@ def test_successful_control_and_monitoring_requests_have_no_line(api, lines, mon
     assert (line["route"], line["status"], line["code"]) == (HOT, 422, "invalid_request")
 
 
+def test_successful_reading_has_no_line(api, lines):
+    assert api.get("/v1/models").status_code == 200
+    assert lines() == []
+    assert api.get("/v1/models/nobody").status_code == 404
+    assert [line["route"] for line in lines()] == ["/v1/models/{model}"]
+
+
 def test_slow_control_request_has_a_line(caplog, lines):
     log = RequestLog([HOT], slow_s=0.25, max_refusals=10)
-    assert not log.may_log(HOT, 0.249)
-    assert log.may_log(HOT, 0.25)
+    assert not log.may_log("POST", HOT, 0.249)
+    assert log.may_log("POST", HOT, 0.25)
     for seconds in (0.249, 0.25):
         log_answer(log, seconds=seconds)
     assert [(line["duration_ms"], line["slow"]) for line in lines()] == [(250.0, True)]
     caplog.clear()
     caplog.set_level(logging.DEBUG, "service.requests")
-    assert log.may_log(HOT, 0.001)
+    assert log.may_log("POST", HOT, 0.001)
     log_answer(log)
     assert [line["level"] for line in lines()] == ["DEBUG"]
 

@@ -19,7 +19,7 @@ def test_models_are_listed_and_shown(run_command, arm):
     shown = run_command("models", "show", name, "--json")
     assert shown["model"]["latest_version"] >= 2
     assert shown["version"]["version"] == shown["model"]["serving_version"]
-    text = run_command("models", "show", name, "--version", 1)
+    text = run_command("models", "show", f"{name}@1")
     assert "version 1: se, 2 joints: joint1, joint2" in text
     assert "not judged: No samples were held out of its training" in text
 
@@ -33,7 +33,9 @@ def test_promotion_can_be_rolled_back(run_command, arm):
     run_command(*promote, 2)
     assert "version 1" in run_command(*promote, 1, "--alias", "night")
     assert run_command(*promote, "night", "--alias", "day", "--json")["version"] == 1
-    assert run_command("predict", name, "--q", "0.1,0.2", "--alias", "day", "--json")["version"] == 1
+    assert run_command("predict", f"{name}@day", "--q", "0.1,0.2", "--json")["version"] == 1
+    assert run_command("predict", f"{name}@1", "--q", "0.1,0.2", "--json")["version"] == 1
+    assert "version 1: " in run_command("models", "show", f"{name}@day")
     assert f"day → {name} version 1" in run_command("models", "alias", name, "day")
     run_command("models", "alias", name, "day", 2)
     assert run_command("models", "alias", name, "day", "--json")["version"] == 2
@@ -51,7 +53,7 @@ def test_versions_are_compared(run_command, arm):
 
 def test_archive_is_exported_imported_and_deleted(run_command, arm, run_rejected_command, tmp_path):
     name, path = arm[0], tmp_path / "arm.tar"
-    assert run_command("models", "export", name, path, "--version", 1, "--json")["bytes"] == path.stat().st_size
+    assert run_command("models", "export", f"{name}@1", path, "--json")["bytes"] == path.stat().st_size
     made = run_command("models", "import", path, "--name", "cli-imported", "--json")
     assert (made["model"], made["version"]) == ("cli-imported", 1)
     delete = ("models", "delete", "cli-imported")
@@ -62,11 +64,11 @@ def test_archive_is_exported_imported_and_deleted(run_command, arm, run_rejected
 
 def test_version_is_exported_as_c(run_command, run_rejected_command, arm, robot_arm, tmp_path):
     folder, export = tmp_path / "made" / "c", ("models", "export", robot_arm)
-    written = run_command(*export, "--c", folder, "--version", 1, "--json")
+    written = run_command(*export, "--c", folder, "--json")
     assert sorted(written.values()) == sorted(map(str, folder.iterdir()))
     assert f'#define LIPSERVE_MODEL "{robot_arm}"' in (folder / "lipserve_model.h").read_text()
-    assert "cc -O2 -c" in run_command(*export, "--c", folder, "--version", 1)
-    message = run_rejected_command("models", "export", arm[0], "--c", tmp_path / "none", "--version", 1)
+    assert "cc -O2 -c" in run_command(*export, "--c", folder)
+    message = run_rejected_command("models", "export", f"{arm[0]}@1", "--c", tmp_path / "none")
     assert "estimator is 'se', expected one of rigid-body" in message
     assert not (tmp_path / "none").exists()
     both = "give an archive to write or --c FOLDER, not both"
@@ -76,17 +78,17 @@ def test_version_is_exported_as_c(run_command, run_rejected_command, arm, robot_
 
 def test_estimated_arm_is_shown(run_command, run_rejected_command, robot_arm):
     parts = ("joint frames", "rotor kg·m²", "mass, first moment", "shift 2", "mirror image", "-0.05 ± 0.01")
-    text = run_command("models", "show", robot_arm, "--version", 1)
+    text = run_command("models", "show", f"{robot_arm}@1")
     assert lacking(text, f"warning: {WARNING}", *parts) == []
     assert "mirror image" not in run_command("models", "show", robot_arm)
-    assert describe(run_command("models", "urdf", robot_arm, "--version", 1)).joint_names == JOINTS
+    assert describe(run_command("models", "urdf", f"{robot_arm}@1")).joint_names == JOINTS
     assert "has no rigid bodies" in run_rejected_command("models", "urdf", robot_arm)
 
 
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        (("models", "show", "cli-arm", "--version", 99), "`lipserve models show MODEL` shows the versions"),
+        (("models", "show", "cli-arm@99"), "`lipserve models show MODEL` shows the versions"),
         (("models", "alias", "cli-arm", "noon"), "`lipserve models alias cli-arm noon VERSION` creates it"),
         (("evaluate", "cli-arm", "ds_none"), "`lipserve data list` shows the data sets"),
         (("evaluate", "cli-arm", "nowhere.csv"), "`lipserve data list` shows the data sets"),

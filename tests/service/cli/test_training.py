@@ -20,7 +20,8 @@ def test_train_evaluate_and_predict_from_a_recording(run_command, server, record
     path = recording(11, samples=120, rate=10.0)
     types = ("--joint-types", "revolute, revolute", "--hold-out", 0.25, "--hold-out-by", "blocks")
     text = run_command("train", path, "--model", "from-cli", *types, *QUICKLY)
-    held = server.client.get("/v1/models/from-cli/versions/1").json()["lineage"]["holdout"]
+    version = server.client.get("/v1/models/from-cli/versions/1").json()
+    held = version["lineage"]["holdout"]
     assert (held["split"]["kind"], held["split"]["share"]) == ("blocks", 0.25)
     low, high = (f"{100 * held[f'coverage_{bound}'][0]:.0f} %" for bound in ("low", "high"))
     parts = (
@@ -28,7 +29,7 @@ def test_train_evaluate_and_predict_from_a_recording(run_command, server, record
         f"{held['samples']} held-out samples",
         f"{held['rmse'][1]:.2g} N·m",
         f"{low} to {high}",
-        "usable",
+        version["verdict"]["label"],
     )
     assert lacking(text, *parts) == []
 
@@ -230,7 +231,7 @@ def test_hold_out_only_data_are_never_learnt(run_command, server, recording):
     for number, learnt in ((1, True), (2, False)):
         lineage = server.client.get(f"/v1/models/cli-only/versions/{number}").json()["lineage"]
         assert lineage["holdout"]["learnt"] is learnt
-    judged = run_command("evaluate", "cli-only", lineage["datasets"][0]["id"], "--held-out", "--version", 1)
+    judged = run_command("evaluate", "cli-only@1", lineage["datasets"][0]["id"], "--held-out")
     assert "evaluated before training on them" in " ".join(judged.split())
 
 

@@ -25,7 +25,7 @@ def test_verdict_is_the_same_in_api_and_command_line(asking, lipserve, name):
     verdict = shown["verdict"]
     assert (verdict["level"], case.words in verdict["reason"]) == (case.level, True), verdict["reason"]
     assert jobs[name]["verdict"] == verdict
-    code, text, err = lipserve("models", "show", model, "--version", number, "--url", server.url)
+    code, text, err = lipserve("models", "show", f"{model}@{number}", "--url", server.url)
     told = " ".join(text.split())
     assert (code, f"{verdict['label']}: {in_shell(verdict['reason'])}" in told) == (0, True), f"{told} {err}"
     assert shown["promotion"]["answers"] == case.serves

@@ -67,3 +67,18 @@ def test_full_queue_is_reported(no_worker):
     waiting.append(queue(no_worker, "m", dataset, options=QUICK)["id"])
     for name in waiting[1:]:
         assert no_worker.post(f"/v1/jobs/{name}/cancel").json()["state"] == "cancelled"
+
+
+def test_robot_of_the_data_sets_is_the_default(api, run_here):
+    data = upload(api, stream(samples=60, seed=72), robot="double-pendulum")["id"]
+    other = upload(api, stream(samples=60, seed=73))["id"]
+
+    def robot(*datasets, **request):
+        return post_job(api, *datasets, **{"model": "default-robot", "estimator": "rigid-body", **request}).json()[
+            "robot"
+        ]
+
+    assert robot(data) == "double-pendulum"
+    assert robot(data, robot=None) is None
+    assert robot(data, estimator="se") is None
+    assert robot(data, other) is None  # one of them has no robot

@@ -1,5 +1,6 @@
 """A training job from the request to the version that it creates."""
 
+import logging
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -186,3 +187,11 @@ def test_job_learns_nothing_from_stored_corrupt_rows(api, monkeypatch):
     assert (found["fit"]["samples_corrupt"], found["fit"]["samples_given"]) == (1, 299)
     assert "corrupt" not in expected["lineage"]
     np.testing.assert_allclose(found["noise_std"], expected["noise_std"], rtol=1e-6)
+
+
+def test_job_logs_three_lines(api, run_here, caplog):
+    caplog.set_level(logging.INFO, "service.training")
+    job = queue(api, "logged", upload(api, stream(samples=60, seed=71))["id"])["id"]
+    assert run_here(job)["state"] == "succeeded"
+    said = [record.getMessage() for record in caplog.records if job in record.getMessage()]
+    assert [line.split(": ")[1].split(" ")[0] for line in said] == ["queued", "started", "version"]

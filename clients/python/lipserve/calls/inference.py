@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lipserve.call import Answer, Call, Route, document, given, record, route
+from lipserve.call import Answer, Call, Route, document, given, record, route, split_name
 from lipserve.records.server import (
     Health,
     Live,
@@ -45,7 +45,7 @@ def predict(
     """Predict torques and their standard deviations at one or N motions.
 
     Args:
-        model: Name of the model.
+        model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
         q: (n,) or (N, n) positions, rad (prismatic: m).
         dq: Velocities, rad/s, shaped as q.
         ddq: Accelerations, rad/s², shaped as q.
@@ -84,8 +84,9 @@ def predict(
         body["history"] = {name: np.array(values, np.float64, ndmin=axes).tolist() for name, values, axes in parts}
     if payload is not None:
         body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
-    body |= given(version=version, alias=alias, min_revision=min_revision)
-    return _route(read_prediction, names={"model": model}, json=body)
+    name, which = split_name(model, version, alias)
+    body |= which | given(min_revision=min_revision)
+    return _route(read_prediction, names={"model": name}, json=body)
 
 
 @route("POST", "/v1/models/{model}/evaluate", repeatable=True)
@@ -101,7 +102,7 @@ def evaluate(
     """Evaluate a model on a data set.
 
     Args:
-        model: Name of the model.
+        model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
         dataset: Id or name of the data set.
         version: Version number. Default: the serving version.
         alias: Alias of the version, instead of its number.
@@ -115,8 +116,9 @@ def evaluate(
     Example:
         >>> print(client.evaluate("panda-sim", "ds_0123456789abcdef"))
     """
-    body = {"dataset": dataset, "part": part} | given(version=version, alias=alias, min_revision=min_revision)
-    return _route(read_evaluation, names={"model": model}, json=body)
+    name, which = split_name(model, version, alias)
+    body = {"dataset": dataset, "part": part} | which | given(min_revision=min_revision)
+    return _route(read_evaluation, names={"model": name}, json=body)
 
 
 @route("POST", "/v1/models/{model}/compare", repeatable=True)
@@ -142,7 +144,7 @@ def trace(
     """Return measured and predicted torque at rows of a data set.
 
     Args:
-        model: Name of the model.
+        model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
         dataset: Id or name of the data set.
         version: Version number. Default: the serving version.
         alias: Alias of the version, instead of its number.
@@ -153,8 +155,9 @@ def trace(
         components: Components of the torque to return too.
     """
     body = {"dataset": dataset, "part": part, "start": start, "points": points, "components": list(components)}
-    body |= given(version=version, alias=alias, stop=stop)
-    return _route(read_trace, names={"model": model}, json=body)
+    name, which = split_name(model, version, alias)
+    body |= which | given(stop=stop)
+    return _route(read_trace, names={"model": name}, json=body)
 
 
 V2_MODEL, V2_VERSION = "/v2/models/{model}", "/v2/models/{model}/versions/{version}"
@@ -227,7 +230,7 @@ def infer(
     """Run a model on named tensors (Open Inference Protocol). `predict` does the same with described results.
 
     Args:
-        model: Name of the model.
+        model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
         inputs: Tensors by name, sent as FP64.
         outputs: Names of the outputs. Default: all.
         version: Version number. Default: the serving version.

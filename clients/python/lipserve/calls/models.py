@@ -8,7 +8,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from lipserve.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
+from lipserve.call import (
+    KEY_HEADER,
+    Answer,
+    Call,
+    Page,
+    Route,
+    given,
+    new_key,
+    nothing,
+    page,
+    record,
+    route,
+    split_name,
+)
 from lipserve.records.audit import AuditEntry
 from lipserve.records.jobs import Job
 from lipserve.records.models import Alias, Model
@@ -25,7 +38,7 @@ def train(
     estimator: str | None = None,
     joint_types: Sequence[str] | None = None,
     options: Mapping[str, Any] | None = None,
-    robot: str | None = None,
+    robot: str | Literal[False] | None = None,
     holdout: Mapping[str, Any] | Literal[False] | None = None,
     promotion: PromotionOption | None = None,
     base: str | None = None,
@@ -40,12 +53,13 @@ def train(
         estimator: Name of the estimator. Default: `auto`, which compares several.
         joint_types: (n,) `revolute` or `prismatic`. Default: those of the data sets' robot, else all revolute.
         options: Fit options; see `options` of POST /v1/jobs.
-        robot: Profile such as panda, or id of an uploaded URDF, for rigid-body estimators.
+        robot: Profile such as panda, or id of an uploaded URDF, for rigid-body estimators. Default: the robot of the
+            data sets; False for none.
         holdout: Part to hold out for evaluation, {"share": 0.3} by default; False for none. The version is then
             trained on all samples, unless the part has {"only": True}.
-        promotion: `ask`: the version becomes the serving version if it passes the check on held-out data; `always`:
+        promotion: `ask`: the version becomes the serving version if its verdict is usable; `always`:
             in any case. Default: the service's setting.
-        base: Version of another unit of the same robot to start from, as `model:3` or `model@alias`.
+        base: Version of another unit of the same robot to start from, as `model@3` or `model@alias`.
         idempotency_key: The same request with the same key queues one job, also from other clients.
 
     Returns:
@@ -71,7 +85,7 @@ def check_training(
     estimator: str | None = None,
     joint_types: Sequence[str] | None = None,
     options: Mapping[str, Any] | None = None,
-    robot: str | None = None,
+    robot: str | Literal[False] | None = None,
     holdout: Mapping[str, Any] | Literal[False] | None = None,
     promotion: PromotionOption | None = None,
     base: str | None = None,
@@ -90,7 +104,7 @@ def _training_body(
     estimator: str | None,
     joint_types: Sequence[str] | None,
     options: Mapping[str, Any] | None,
-    robot: str | None,
+    robot: str | Literal[False] | None,
     holdout: Mapping[str, Any] | Literal[False] | None,
     promotion: PromotionOption | None,
     base: str | None,
@@ -99,13 +113,13 @@ def _training_body(
     body = {"model": model, "datasets": list(datasets), "options": dict(options or {})} | given(
         estimator=estimator,
         joint_types=None if joint_types is None else list(joint_types),
-        robot=robot,
+        robot=robot or None,
         holdout=dict(holdout) if holdout else None,
         promotion=promotion,
         base=base,
     )
-    if holdout is False:
-        body["holdout"] = None  # explicit null: a missing field means the service's default
+    # explicit null: a missing field means the service's default
+    body |= {name: None for name, value in (("holdout", holdout), ("robot", robot)) if value is False}
     return body
 
 
@@ -222,7 +236,7 @@ def export(
     """Export a version as an archive for `import_model`, or as C code.
 
     Args:
-        model: Name of the model.
+        model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
         path: Archive to write; it is written completely or not at all. For C: the folder.
         version: Version number. Default: the serving version.
         alias: Alias of the version, instead of its number.
@@ -244,10 +258,11 @@ def export(
                     (path / name).write_bytes(content.read())
         return path
 
-    params = given(version=version, alias=alias) | {"learnt": learnt}
+    name, which = split_name(model, version, alias)
+    params = which | {"learnt": learnt}
     if format == "c":
-        return _route(read, names={"model": model}, params={**params, "format": format}, timeout=ARCHIVE_TIMEOUT)
-    return _route(read, names={"model": model}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
+        return _route(read, names={"model": name}, params={**params, "format": format}, timeout=ARCHIVE_TIMEOUT)
+    return _route(read, names={"model": name}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
 
 
 @route("GET", "/v1/models/{model}/urdf")
@@ -257,9 +272,8 @@ def urdf(_route: Route, model: str, version: int | None = None, alias: str | Non
     Raises:
         ApiError: The estimator has no rigid bodies.
     """
-    return _route(
-        lambda answer: answer.body.decode(), names={"model": model}, params=given(version=version, alias=alias)
-    )
+    name, which = split_name(model, version, alias)
+    return _route(lambda answer: answer.body.decode(), names={"model": name}, params=which)
 
 
 @route("POST", "/v1/models/import")
