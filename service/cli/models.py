@@ -17,7 +17,7 @@ from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
 from service.cli.options import Data, Json, Limit, Model, ModelVersion, Promotion, Url, Yes, confirm, group
 from service.cli.wording import in_shell
-from service.foundation.text import counted
+from service.foundation.text import counted, percent
 
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
@@ -177,6 +177,36 @@ def alias(
         for move in aliases[0].history
     )
     print_result(aliases[0], as_json, f"{name} → {model} version {aliases[0].version}", *moves)
+
+
+@app.command()
+def thresholds(
+    model: Model,
+    max_error: Annotated[
+        float | None, typer.Option(help="Max mean squared error of a joint, as a share of its torque's variance.")
+    ] = None,
+    min_coverage: Annotated[float | None, typer.Option(help="Min coverage of the 95 % intervals.")] = None,
+    max_width: Annotated[
+        float | None, typer.Option(help="Max width of the 95 % intervals, relative to those of the mean torque.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Print the thresholds of a model's verdicts, or set some of them; the others stay."""
+    asked = {"max_error": max_error, "min_coverage": min_coverage, "max_width": max_width}
+    changed = {name: value for name, value in asked.items() if value is not None}
+    with connected(url) as client:
+        known = client.model(model).thresholds
+        if changed:
+            before = {name: getattr(known, name) for name in asked}
+            known = client.set_thresholds(model, **{**before, **changed}).thresholds
+    print_result(
+        known,
+        as_json,
+        f"{model}: a version is wrong if the squared error of a joint is above {known.max_error:g} of its variance, or "
+        f"coverage below {percent(known.min_coverage)}; too uncertain if intervals are wider than {known.max_width:g} "
+        "times those of the mean torque",
+    )
 
 
 @app.command()

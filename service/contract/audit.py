@@ -12,6 +12,7 @@ Change = Literal[
     "model deleted",
     "alias moved",
     "learning set",
+    "thresholds set",
     "observations unlearnt",
     "observations replayed",
     "learning rolled back",

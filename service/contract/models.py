@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from lipcore.vocabulary import JointType, TorqueConvention
 from service.contract.states import PromotionOption
-from service.contract.verdict import Verdict
+from service.contract.verdict import Thresholds, Verdict
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
@@ -150,6 +150,7 @@ class Model(BaseModel):
         description="Version that serves queries without a version; null if all versions are candidates"
     )
     aliases: dict[str, int] = Field(description="Versions by alias, without `serving`")
+    thresholds: Thresholds = Field(description="Thresholds of the verdicts")
     versions: list[VersionSummary]
 
 

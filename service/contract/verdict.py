@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.model.verdict import JudgedOn, Level
+from lipcore.model.verdict import OPTIONS, JudgedOn, Level
 
 LABELS: dict[Level, str] = {
     "wrong": "wrong",
@@ -14,6 +14,33 @@ LABELS: dict[Level, str] = {
     "usable": "usable",
 }
 """Words for each level."""
+
+
+class Thresholds(BaseModel):
+    """Thresholds of the verdicts on the versions of a model."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"max_error": 0.25}]})
+
+    max_error: float = Field(
+        OPTIONS.max_error,
+        gt=0,
+        le=1,
+        description="Max mean squared error of a joint / variance of its torque. Above, the version is `wrong`",
+    )
+    min_coverage: float = Field(
+        OPTIONS.min_coverage,
+        ge=0.5,
+        le=0.95,
+        description="Min coverage of the 95 % intervals, within sampling error. If it is below, the version is `wrong`",
+    )
+    max_width: float = Field(
+        OPTIONS.max_width,
+        gt=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Max width of the 95 % intervals / that of the mean torque. If it is above, the version is "
+        "`too_uncertain`",
+    )
 
 
 class JointVerdict(BaseModel):

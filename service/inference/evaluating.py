@@ -140,7 +140,7 @@ def evaluate(
         joint_names=list(served.model.joint_names),
         in_training=in_training,
         judged=judged is not None,
-        verdict=verdicts.of_evaluation(fields, _manifest(loaded, served), origin, row),
+        verdict=_verdict(loaded, served, fields, origin, row),
         **fields,
     )
 
@@ -152,8 +152,15 @@ def judge(
     used = recorded.used
     figures = evaluation(used, answer, served.model.training_range)
     figures |= _repeats(loaded, served, used, in_training)
-    row, manifest = store.find(loaded.database, recorded.id), _manifest(loaded, served)
-    return verdicts.of_evaluation(figures, manifest, "training" if in_training else "recording", row)
+    row = store.find(loaded.database, recorded.id)
+    return _verdict(loaded, served, figures, "training" if in_training else "recording", row)
+
+
+def _verdict(
+    loaded: LoadedModels, served: ServedModel, figures: dict[str, Any], origin: JudgedOn, row: DatasetRow
+) -> Verdict:
+    options = registry.verdict_options(loaded.database, [served.name])[served.name]
+    return verdicts.of_evaluation(figures, _manifest(loaded, served), origin, row, options)
 
 
 def _compared(

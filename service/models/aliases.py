@@ -43,7 +43,8 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
 
 def _check_verdict(loaded: LoadedModels, model: str, version: int) -> None:
     """Raise ConflictError unless the verdict on a version is usable."""
-    verdict = verdicts.of_version(registry.find(loaded.database, model, version).manifest)
+    options = registry.verdict_options(loaded.database, [model])[model]
+    verdict = verdicts.of_version(registry.find(loaded.database, model, version).manifest, options)
     if not verdict.serves:
         raise ConflictError(texts.describe_refusal(version, texts.describe_verdict(verdict.label, verdict.reason)))
 

@@ -13,7 +13,9 @@ from sqlalchemy.orm import Session
 import lipcore
 from lipcore.estimators.base import RobotKind
 from lipcore.files.persistence import checksums, read_manifest
+from lipcore.model.verdict import OPTIONS, VerdictOptions
 from service.contract.models import Model, ModelPage, Promotion, Version, VersionSummary
+from service.contract.verdict import Thresholds
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
 from service.foundation.settings import shipped_models
 from service.models import verdicts
@@ -310,7 +312,28 @@ def show_version(database: Database, model: str, version: int) -> Version:
     row = find(database, model, version)
     fields = {name: row.manifest[name] for name in Version.model_fields if name in row.manifest}
     about = {"model": row.model, "version": row.version, "created_at": row.created_at, "job": row.job}
-    return Version(**about, verdict=verdicts.of_version(row.manifest), **fields)
+    options = verdict_options(database, [model]).get(model, OPTIONS)
+    return Version(**about, verdict=verdicts.of_version(row.manifest, options), **fields)
+
+
+def verdict_options(database: Database, models: Collection[str]) -> dict[str, VerdictOptions]:
+    """Return the thresholds of models by name; those that do not exist are missing."""
+    with database.session() as session:
+        rows = session.scalars(select(ModelRow).where(ModelRow.name.in_(models)))
+        return {row.name: verdicts.options_of(row) for row in rows}
+
+
+def set_thresholds(database: Database, model: str, thresholds: Thresholds) -> Model:
+    """Replace the thresholds of a model's verdicts; return the model; raise NotFoundError. What serves stays."""
+    with database.transaction() as session:
+        row = session.scalar(select(ModelRow).where(ModelRow.name == model))
+        if row is None:
+            raise not_found("model", model)
+        before, after = row.thresholds, thresholds.model_dump()
+        if after != before:
+            audit.note(session, model, "thresholds set", before=before, after=after)
+            row.thresholds = after
+        return _show(session, row)
 
 
 def page(database: Database, part: Page) -> ModelPage:
@@ -325,18 +348,20 @@ def _show(session: Session, row: ModelRow) -> Model:
         session.scalars(select(VersionRow).where(VersionRow.model == row.name).order_by(VersionRow.version))
     )
     aliases = session.scalars(select(AliasRow).where(AliasRow.model == row.name).order_by(AliasRow.alias))
+    options = verdicts.options_of(row)
     return Model(
         name=row.name,
         created_at=row.created_at,
         latest_version=versions[-1].version,
         serving_version=serving_version(session, row.name),
         aliases={each.alias: each.version for each in aliases},
+        thresholds=Thresholds(**(row.thresholds or {})),
         versions=[
             VersionSummary(
                 version=v.version,
                 created_at=v.created_at,
                 estimator=v.manifest["estimator"],
-                verdict=verdicts.of_version(v.manifest),
+                verdict=verdicts.of_version(v.manifest, options),
                 promotion=v.manifest.get(PROMOTION),
             )
             for v in versions

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from lipcore.model.verdict import Fault, JudgedFigures, JudgedOn, OutsideFigures
 from service.contract.datasets import Cause, Remedy
 from service.contract.verdict import LABELS, Verdict
 from service.models import texts
-from service.storage.database import DatasetRow
+from service.storage.database import DatasetRow, ModelRow
 
 _REQUIRED = ("nmse", "rmse", "coverage", "coverage_low", "coverage_high", "independent", "interval_width")
 SPOILING: frozenset[Cause] = frozenset(
@@ -23,6 +24,11 @@ SPOILING: frozenset[Cause] = frozenset(
     }
 )
 """Causes of faults with which a model is wrong, even if its figures on the same recording are good."""
+
+
+def options_of(row: ModelRow | None) -> VerdictOptions:
+    """Return the thresholds of a model; the defaults for a new one."""
+    return replace(verdict.OPTIONS, **((row and row.thresholds) or {}))
 
 
 def of_version(manifest: Mapping[str, Any], options: VerdictOptions = verdict.OPTIONS) -> Verdict:

@@ -16,6 +16,7 @@ from lipcore import extras
 from lipcore.estimators.base import BaseMismatchError, RobotKind, check_base
 from lipcore.estimators.catalogue import UnknownEstimatorError, check_estimator
 from lipcore.estimators.options import FitOptions
+from lipcore.model.verdict import OPTIONS
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, TORCH_ESTIMATORS
 from service.contract.jobs import MAX_OPTIONS, Job, JobDraft, JobPage, JobRequest
@@ -313,10 +314,12 @@ def represent_all(database: Database, rows: Sequence[JobRow]) -> list[Job]:
     made = {(row.model, row.version) for row in rows if row.version is not None}
     with database.session() as session:
         versions = registry.rows_of(session, made) if made else {}
+    options = registry.verdict_options(database, {model for model, _ in made})
     jobs = []
     for row in rows:
         version = None if row.version is None else versions.get((row.model, row.version))
-        verdict = None if version is None else verdicts.of_version(version.manifest)
+        known = options.get(row.model, OPTIONS)
+        verdict = None if version is None else verdicts.of_version(version.manifest, known)
         jobs.append(represent(row).model_copy(update={"verdict": verdict}))
     return jobs
 

@@ -19,7 +19,7 @@ from lipcore.data.samples import Samples
 from lipcore.estimators.base import RobotKind
 from lipcore.files.manifest import ModelFormatError
 from lipcore.model.torque_model import TorqueModel
-from lipcore.model.verdict import OPTIONS
+from lipcore.model.verdict import OPTIONS, VerdictOptions
 from service.contract.holdout import HoldoutLineage
 from service.contract.models import Promotion
 from service.contract.states import PromotionOption
@@ -48,13 +48,14 @@ def judge(
     with database.session() as session:
         number = registry.serving_version(session, model)
         serving = None if number is None else session.get_one(VersionRow, (model, number))
+    options = registry.verdict_options(database, [model]).get(model, OPTIONS)
     about = {"joint_names": trained.joint_names, "joint_types": trained.joint_types, "lineage": lineage}
     compared = None
     if held_out is not None and serving is not None:
-        compared = _against(files, serving, trained, held_out, lineage)
+        compared = _against(files, serving, trained, held_out, lineage, options)
         if compared.rmse is not None:
             lineage["holdout"]["serving"] = {"version": serving.version, "rmse": compared.rmse}
-    verdict = verdicts.of_version(about)
+    verdict = verdicts.of_version(about, options)
     if not verdict.serves:
         return Promotion.of(False, describe_verdict(verdict.label, verdict.reason), number, option)
     reason = verdict.reason if compared is None else f"{verdict.reason} {compared.reason}"
@@ -90,7 +91,12 @@ class ServingComparison:
 
 
 def _against(
-    files: Files, serving: VersionRow, trained: TorqueModel, held_out: Samples, lineage: dict[str, Any]
+    files: Files,
+    serving: VersionRow,
+    trained: TorqueModel,
+    held_out: Samples,
+    lineage: dict[str, Any],
+    options: VerdictOptions,
 ) -> ServingComparison:
     """Compare a version with the serving version, or return why they are not compared."""
     name, manifest = f"version {serving.version}", serving.manifest
@@ -106,20 +112,20 @@ def _against(
         return ServingComparison(True, texts.describe_learnt_held_out(name))
     if len(scores.rows) < 2:
         return ServingComparison(True, texts.describe_too_short(name), rmse)
-    if foreign := _find_foreign_joints(serving, trained, held_out, rmse):
+    if foreign := _find_foreign_joints(serving, trained, held_out, rmse, options):
         return ServingComparison(False, texts.describe_foreign_recording(name, foreign), rmse)
     serves, reason = _compare(scores.difference_from(before), name)
     return ServingComparison(serves, reason, rmse)
 
 
 def _find_foreign_joints(
-    serving: VersionRow, trained: TorqueModel, held_out: Samples, rmse: list[float] | None
+    serving: VersionRow, trained: TorqueModel, held_out: Samples, rmse: list[float] | None, options: VerdictOptions
 ) -> list[str]:
     """Return the joints on which a usable serving version is no better than the mean torque, unlike the new version.
 
     The recording is then of another robot, or with another payload or torque unit.
     """
-    if rmse is None or not verdicts.of_version(serving.manifest).serves:
+    if rmse is None or not verdicts.of_version(serving.manifest, options).serves:
         return []
     limit = np.sqrt(OPTIONS.max_error) * held_out.tau.std(axis=0)
     own = np.sqrt(np.mean((held_out.tau - answer_of(trained, held_out).mean) ** 2, axis=0))

@@ -115,6 +115,7 @@ class Calls:
     delete_version = One(calls.models.delete_version)
     aliases = One(calls.models.aliases)
     set_alias = One(calls.models.set_alias)
+    set_thresholds = One(calls.models.set_thresholds)
     remove_alias = One(calls.models.remove_alias)
     rollback_alias = One(calls.models.rollback_alias)
     export = One(calls.models.export)

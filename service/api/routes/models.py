@@ -15,6 +15,7 @@ from service.api.limits.upload import Kinds, receive_to
 from service.api.route import Route
 from service.contract import models as schema
 from service.contract.states import PromotionOption
+from service.contract.verdict import Thresholds
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
@@ -149,6 +150,15 @@ def show(loaded: LoadedModelsDep, model: str) -> schema.Model:
     record = registry.show(loaded.database, model)
     loaded.announce([record.name])
     return record
+
+
+@router.put(
+    "/{model}/thresholds", summary="Set the thresholds of a model's verdicts", responses=responses(NotFoundError)
+)
+@needs(ADMIN)
+def set_thresholds(loaded: LoadedModelsDep, model: str, thresholds: Thresholds) -> schema.Model:
+    """Replace all thresholds. Omitted ones get their defaults. Verdicts change at once; what serves does not."""
+    return registry.set_thresholds(loaded.database, model, thresholds)
 
 
 @router.get("/{model}/versions/{version}", summary="Retrieve a version", responses=responses(NotFoundError))

@@ -64,7 +64,7 @@ def list_models(learners: Learners, part: Page) -> OverviewPage:
                 created_at=version.created_at,
                 joint_names=manifest["joint_names"],
                 joint_types=manifest["joint_types"],
-                verdict=verdicts.of_version(manifest),
+                verdict=verdicts.of_version(manifest, verdicts.options_of(row)),
                 candidate=pointers.get((row.name, CANDIDATE)),
                 arm=sketch_arm(manifest),
                 position=_position(learners, row.name, manifest),

@@ -118,6 +118,8 @@ class ModelRow(Base):
     created_at: Mapped[str]
     last_version: Mapped[int] = mapped_column(default=0, server_default="0")
     """Highest version number given so far; no number is given twice."""
+    thresholds: Mapped[dict[str, Any] | None] = mapped_column(JSON, default=None)
+    """Thresholds of the verdicts on its versions, see `Thresholds`; None for the defaults."""
 
 
 class DeletedModelRow(Base):

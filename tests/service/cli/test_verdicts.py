@@ -69,3 +69,19 @@ def test_evaluation_names_a_fault_of_the_recording(asking):
     assert verdict["level"] == "not_judged"
     assert "joint2 has the opposite sign" in verdict["reason"]
     assert data in verdict["action"]
+
+
+def test_thresholds_of_a_model_change_its_verdicts(asking, lipserve):
+    server, jobs = asking
+    model = jobs["repeated-motion"]["model"]
+    text = lipserve("models", "thresholds", model, "--max-width", "0.005", "--url", server.url)[1]
+    assert "0.005 times" in text
+    shown = server.client.get(f"/v1/models/{model}").json()
+    assert shown["thresholds"] == {"max_error": 0.9, "min_coverage": 0.9, "max_width": 0.005}
+    verdict = shown["versions"][0]["verdict"]
+    assert (verdict["level"], shown["serving_version"]) == ("too_uncertain", 1)
+    dataset = jobs["repeated-motion"]["datasets"][0]
+    asked = {"dataset": dataset, "part": "held_out"}
+    assert server.client.post(f"/v1/models/{model}/evaluate", json=asked).json()["verdict"]["level"] == "too_uncertain"
+    error(server.client.put(f"/v1/models/{model}/aliases/safe", json={"version": 1}), 409, "conflict")
+    assert error(server.client.put(f"/v1/models/{model}/thresholds", json={"max_error": 2}), 422, "invalid_request")

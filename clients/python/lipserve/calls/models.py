@@ -211,6 +211,30 @@ def set_alias(_route: Route, model: str, alias: str, version: int | str, overrid
     return _route(record(Alias), names={"model": model, "alias": alias}, json={**body, "override": override})
 
 
+@route("PUT", "/v1/models/{model}/thresholds")
+def set_thresholds(
+    _route: Route,
+    model: str,
+    max_error: float | None = None,
+    min_coverage: float | None = None,
+    max_width: float | None = None,
+) -> Call[Model]:
+    """Replace the thresholds of a model's verdicts; those that are None get their defaults.
+
+    Args:
+        model: Name of the model.
+        max_error: Max mean squared error of a joint, as a share of the variance of its torque.
+        min_coverage: Min coverage of the 95 % intervals, within sampling error.
+        max_width: Max width of the 95 % intervals, relative to those of the mean torque.
+
+    Example:
+        >>> client.set_thresholds("my-arm", max_error=0.25).thresholds.max_error
+        0.25
+    """
+    thresholds = given(max_error=max_error, min_coverage=min_coverage, max_width=max_width)
+    return _route(record(Model), names={"model": model}, json=thresholds)
+
+
 @route("DELETE", "/v1/models/{model}/aliases/{alias}")
 def remove_alias(_route: Route, model: str, alias: str) -> Call[None]:
     """Remove an alias. Its version stays."""

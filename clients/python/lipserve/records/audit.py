@@ -33,6 +33,7 @@ class AuditEntry(Record, frozen=True, kw_only=True):
         "model deleted",
         "alias moved",
         "learning set",
+        "thresholds set",
         "observations unlearnt",
         "observations replayed",
         "learning rolled back",

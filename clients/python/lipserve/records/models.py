@@ -7,6 +7,19 @@ from typing import Any, Literal
 from lipserve.records import Record
 
 
+class Thresholds(Record, frozen=True, kw_only=True):
+    """Thresholds of the verdicts on the versions of a model.
+
+    max_error: Max mean squared error of a joint / variance of its torque. Above, the version is `wrong`
+    min_coverage: Min coverage of the 95 % intervals, within sampling error. If it is below, the version is `wrong`
+    max_width: Max width of the 95 % intervals / that of the mean torque. If it is above, the version is `too_uncertain`
+    """
+
+    max_error: float = 0.9
+    min_coverage: float = 0.9
+    max_width: float = 1.0
+
+
 class JointVerdict(Record, frozen=True, kw_only=True):
     """Verdict on one joint. Null stands for an unknown value.
 
@@ -98,6 +111,7 @@ class Model(Record, frozen=True, kw_only=True):
     latest_version: Newest version
     serving_version: Version that serves queries without a version; null if all versions are candidates
     aliases: Versions by alias, without `serving`
+    thresholds: Thresholds of the verdicts
     """
 
     name: str
@@ -105,6 +119,7 @@ class Model(Record, frozen=True, kw_only=True):
     latest_version: int
     serving_version: int | None
     aliases: dict[str, int]
+    thresholds: Thresholds
     versions: list[VersionSummary]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-FIRST, HEAD = "0004", "0009"
+FIRST, HEAD = "0004", "0010"
 """The revision of release 0.2.0, the oldest that is upgraded, and the one that this release needs."""
 
 

@@ -126,6 +126,12 @@ CHANGING = {
         {"auto_promote": True},
         {"auto_promote": False},
     ),
+    (PUT, MODEL + "/thresholds"): (
+        sender((PUT, "arm/thresholds", {"max_error": 0.5})),
+        "thresholds set",
+        None,
+        {"max_error": 0.5, "min_coverage": 0.9, "max_width": 1.0},
+    ),
     (DELETE, BATCH): (sender((DELETE, "arm/observations/arm/1")), "observations unlearnt", UNLEARNT, None),
     (POST, BATCH + "/replay"): (replay_contact, "observations replayed", None, REPLAYED),
     (POST, MODEL + "/learning/change"): (resolve_pause, "change decided", PAUSE, {"decision": "ignore"}),
