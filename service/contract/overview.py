@@ -73,6 +73,10 @@ class ModelOverview(BaseModel):
         description="Position at the last row that this process received, rad (m); else a posture of its training"
     )
     idle_s: float | None = Field(description="Time since the last observation, s; null if there was none")
+    lag_s: float | None = Field(
+        description="Time since the arrival of the first row that responses do not contain yet, s; null if the model "
+        "is not in memory"
+    )
     recent: RecentQuality | None = Field(
         description="From the quality window nearest to one hour; null if this process has no observations"
     )

@@ -72,7 +72,8 @@ def list_models(learners: Learners, part: Page) -> OverviewPage:
                 held=row.name in held,
                 failure=learners.status(*key).failure,
                 alarm=alarms.get(row.name),
-                **_monitored_fields(monitors.get(row.name), learners.loaded.peek(row.name), now),
+                lag_s=None if (served := learners.loaded.peek(row.name)) is None else learners.lag(served).seconds,
+                **_monitored_fields(monitors.get(row.name), served, now),
             )
         )
     return OverviewPage(items=items, next_cursor=following)

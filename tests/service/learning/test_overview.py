@@ -51,6 +51,7 @@ def test_recent_window_matches_predictions(learning_model):
     assert np.sqrt(mean) == pytest.approx(np.sqrt(np.square(np.vstack(ratios)).mean(0)), abs=2e-3)
     assert seen["position"] == pytest.approx(observation_batch(2)["q"][-1], abs=1e-6)
     assert seen["idle_s"] >= 0
+    assert seen["lag_s"] >= 0
 
 
 def test_window_course_lists_buckets_oldest_first():
@@ -67,7 +68,7 @@ def test_overview_loads_no_model(learning_service):
     learning_service.publish("never-asked")
     loaded = set(learning_service.service.loaded.versions())
     seen = find_overview(learning_service.client, "never-asked")
-    assert (seen["recent"], seen["payloads"]) == (None, None)
+    assert (seen["recent"], seen["payloads"], seen["lag_s"]) == (None, None, None)
     assert set(learning_service.service.loaded.versions()) == loaded
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from itertools import cycle
+from itertools import cycle, pairwise
 from math import cos, sin
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,9 @@ from tests.system.browser.visitor import PHONE, Visitor
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page, Route
+
+
+BOXES = "(all) => all.map((each) => each.getBoundingClientRect().toJSON())"
 
 
 @pytest.fixture(scope="module")
@@ -49,31 +52,60 @@ def changed(page: Page, name: str, **fields: Any) -> None:
     page.route("**/v1/overview?*", answer)
 
 
-def test_card_shows_quality_of_each_joint(visitor: Visitor, judged: dict[str, Any]) -> None:
-    place = card(visitor.open("#/"), "judged")
+def test_card_says_which_version_serves_and_why(visitor: Visitor, judged: dict[str, Any]) -> None:
+    page = visitor.open("#/")
+    place = card(page, "judged")
+    expect(place).to_contain_text("Version 1 serves")
     expect(place).to_contain_text(judged["verdict"]["label"])
-    expect(place).to_contain_text("Version 1, lip-chain")
+    expect(place.get_by_text(judged["verdict"]["reason"])).to_be_visible()
+    expect(place).to_contain_text("lip-chain")
     expect(place).to_contain_text("no stream yet")
-    expect(place).to_contain_text("On held-out rows.")
-    label = place.get_by_role("img", name="nMSE by joint").get_attribute("aria-label")
+    changed(page, "judged", serving_version=None, candidate=1)
+    expect(place).to_contain_text("No version serves. Version 1 is a candidate")
+    review = place.get_by_role("link", name="Review version 1 of judged")
+    expect(review).to_have_attribute("href", "#/models/judged?tab=versions")
+
+
+def test_card_shows_error_of_each_joint_in_torque_units_and_share_of_range(
+    visitor: Visitor, judged: dict[str, Any]
+) -> None:
+    place = card(visitor.open("#/"), "judged")
+    label = place.get_by_role("img", name="RMSE").get_attribute("aria-label")
     assert label is not None
-    told = [float(each) for each in re.findall(r"joint\d ([\d.e-]+)", label)]
     joints = judged["verdict"]["joints"]
-    expected = [(each["rmse"] / each["mean_rmse"]) ** 2 for each in joints]
-    assert told == pytest.approx(expected, rel=0.05)
-    label = place.get_by_role("img", name="Coverage of the 95 % interval").get_attribute("aria-label")
-    assert label is not None
-    told = [float(each) / 100 for each in re.findall(r"joint\d ([\d.]+)", label)]
-    assert told == pytest.approx([each["coverage"] for each in joints], abs=6e-4)
-    bars = place.locator(".bars.nmse b").all()
+    told = [tuple(map(float, each)) for each in re.findall(r"joint\d ([\d.e-]+)\sN·m, ([\d.]+)\s%", label)]
+    for (error, share), joint in zip(told, joints, strict=True):
+        assert error == pytest.approx(joint["rmse"], rel=0.05)
+        assert share / 100 == pytest.approx(joint["range_share"], rel=0.05)
+    worst = max(joints, key=lambda joint: joint["range_share"])
+    expect(place).to_contain_text(f"largest: {worst['joint'].rpartition('_')[2]}")
+    expect(place).not_to_contain_text("nMSE")
+    bars = place.locator(".bars.rmse b").all()
     colours = [each.evaluate("(bar) => getComputedStyle(bar).backgroundColor") for each in bars]
     assert len(set(colours)) == 2, "each joint has its colour"
-    charts = [place.locator(f".bars.{kind}").bounding_box() for kind in ("nmse", "coverage")]
-    assert charts[0] is not None
-    assert charts[1] is not None
-    assert charts[0]["height"] == charts[1]["height"]
     heights = [each.evaluate("(bar) => bar.getBoundingClientRect().height") for each in bars]
-    assert (heights[0] < heights[1]) == (expected[0] < expected[1])
+    assert (heights[0] < heights[1]) == (joints[0]["range_share"] < joints[1]["range_share"])
+
+
+def test_long_joint_names_fit_into_the_card(windows: Visit, dashboard: Dashboard, judged: dict[str, Any]) -> None:
+    joints = judged["verdict"]["joints"]
+    long = [{**each, "joint": f"{number}{'_shoulder' * 3}_joint"} for number, each in enumerate(joints)]
+    phone = windows(dashboard.server.url, size=PHONE, touch=True)
+    changed(phone.page, "judged", verdict={**judged["verdict"], "joints": long})
+    place = card(phone.open("#/"), "judged")
+    expect(place).to_contain_text("_shoulder_shoulder_shoulder_joint")
+    assert phone.overflow() <= 0
+    boxes = place.locator(".most > *").evaluate_all(BOXES)
+    assert all(one["bottom"] <= other["top"] or one["right"] <= other["left"] for one, other in pairwise(boxes))
+
+
+def test_cards_have_one_size(visitor: Visitor, judged: dict[str, Any]) -> None:
+    page = visitor.open("#/")
+    changed(page, "judged", verdict={**judged["verdict"], "reason": "The errors are large. " * 15})
+    expect(card(page, "judged")).to_contain_text("The errors are large.")
+    boxes = page.get_by_role("region", name="Models").locator("li.robot").evaluate_all(BOXES)
+    assert len(boxes) > 1
+    assert len({(round(each["width"]), round(each["height"])) for each in boxes}) == 1
 
 
 def test_card_draws_the_arm_if_one_was_learnt(visitor: Visitor, judged: dict[str, Any]) -> None:
@@ -81,6 +113,9 @@ def test_card_draws_the_arm_if_one_was_learnt(visitor: Visitor, judged: dict[str
     arm = card(page, "panda-sim").get_by_role("img", name="Learnt arm of panda-sim, 7 joints")
     expect(arm.locator(".axis")).to_have_count(7)
     expect(card(page, "judged")).to_contain_text(f"{judged['estimator']} does not learn an arm")
+    changed(page, "panda-sim", serving_version=None, candidate=1)
+    expect(card(page, "panda-sim")).to_contain_text("No version serves")
+    expect(arm.locator(".axis")).to_have_count(7)  # also that of a candidate
     drawn = [each.get_attribute("d") for each in arm.locator(".axis").all()]
     assert len(set(drawn)) == 7
 
@@ -124,15 +159,16 @@ def test_card_of_a_streaming_robot_is_live_and_shows_its_last_hour(visitor: Visi
     with playing(dashboard.server.url, "glanced", rows, rate=50.0):
         expect(place.get_by_text("live", exact=True)).to_be_visible()
         expect(place.locator(".course path")).to_have_count(2)
-        expect(place).to_contain_text("In the last hour.")
+        expect(place).to_contain_text("Learning up to date")
         cards = page.get_by_role("region", name="Models").locator("li").all()
         order = [each.get_attribute("data-key") for each in cards]
         assert order.index("glanced") < order.index("panda-sim"), "live models come first"
         assert audit(page) == []
     seen = glance(dashboard, "glanced")
     assert seen["recent"]["rows"] > 0
-    changed(page, "glanced", idle_s=65.0)
+    changed(page, "glanced", idle_s=65.0, lag_s=2.1)
     expect(place).to_contain_text("idle for 1\u00a0min 5\u00a0s")
+    expect(place).to_contain_text("2.1\u00a0s behind")
 
 
 def test_models_that_need_attention_come_first(visitor: Visitor, windows: Visit, dashboard: Dashboard) -> None:
@@ -141,18 +177,32 @@ def test_models_that_need_attention_come_first(visitor: Visitor, windows: Visit,
     load = {"stream_id": "cell-1", "state": "payload", "declared": False, "since": None, "rows": 90}
     alarm = {"id": 1, "kind": "novelty", "message": "much is new", "evidence": {}}
     alarm["at"] = page.evaluate("new Date().toISOString()")
-    changed(page, name, held=True, payloads=[{**load, "mass": {"mean": 1.25, "std": 0.05}}], alarm=alarm, candidate=4)
+    changed(
+        page,
+        name,
+        held=True,
+        payloads=[{**load, "mass": {"mean": 1.25, "std": 0.05}}],
+        alarm=alarm,
+        candidate=4,
+        idle_s=5,
+    )
     place = card(page, name)
     expect(place).to_contain_text("Learning is paused until you decide")
-    expect(place).to_contain_text("cell-1: payload 1.25 ± 0.05\u00a0kg.")
+    expect(place).to_contain_text("Payload 1.25 ± 0.05\u00a0kg")
     expect(place).to_contain_text("Version 4 is a candidate.")
     expect(place.get_by_role("link", name="Decide")).to_have_attribute("href", f"#/live/{name}")
     order = [each.get_attribute("data-key") for each in page.get_by_role("region", name="Models").locator("li").all()]
     assert order.index(name) < order.index(dashboard.model), "paused models come before idle ones"
     assert audit(page) == []
     page.unroute_all(behavior="wait")
-    changed(page, name, alarm=alarm)
-    expect(place).to_contain_text("much is new")
+    checked = [
+        {**load, "state": "contact", "mass": None},
+        {**load, "stream_id": "cell-2", "state": "none", "mass": None},
+    ]
+    changed(page, name, alarm=alarm, payloads=checked, idle_s=5)
+    expect(place).to_contain_text("Much is new.")
+    expect(place).to_contain_text("cell-1 checking payload")
+    expect(place).to_contain_text("cell-2 no payload")
     phone = windows(dashboard.server.url, size=PHONE, scheme="dark", touch=True)
     phone.open("#/")
     assert phone.overflow() <= 0

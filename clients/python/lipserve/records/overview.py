@@ -77,6 +77,8 @@ class ModelOverview(Record, frozen=True, kw_only=True):
     arm: Null if the estimator has no arm geometry
     position: Position at the last row that this process received, rad (m); else a posture of its training
     idle_s: Time since the last observation, s; null if there was none
+    lag_s: Time since the arrival of the first row that responses do not contain yet, s; null if the model is not in
+        memory
     recent: From the quality window nearest to one hour; null if this process has no observations
     payloads: Payload of each stream; null if the model has no arm geometry or is not in memory
     held: Whether learning is paused until a person decides
@@ -96,6 +98,7 @@ class ModelOverview(Record, frozen=True, kw_only=True):
     arm: ArmSketch | None
     position: list[float]
     idle_s: float | None
+    lag_s: float | None
     recent: RecentQuality | None
     payloads: list[LivePayload] | None
     held: bool

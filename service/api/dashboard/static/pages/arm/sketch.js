@@ -1,7 +1,7 @@
 // Small drawing of a learnt arm: links, coloured joint axes, masses.
 
 import { jointVar } from "../../colours.js";
-import { h } from "../../dom.js";
+import { html, useEffect, useMemo, useRef, useState } from "../../preact.js";
 import { add, frames, gravityAlignment, scaled, times } from "./kinematics.js";
 
 const AZIMUTH = -0.9, ELEVATION = 0.3; // of the eye, rad
@@ -10,82 +10,81 @@ const ROOM = 0.06;
 const GLIDE_MS = 1800;
 const REDUCED_MOTION = matchMedia("(prefers-reduced-motion: reduce)");
 
-/**
- * Draw an arm {gravity, joints} of `/v1/overview` at positions q. label: for screen readers.
- * Returns {element, pose(q), glide(q)}: `pose` moves the arm at once, `glide` with an animation unless reduced motion is set.
- */
-export function sketch(arm, q, label) {
-  const geometry = { order: arm.joints.map((each) => each.joint), joints: arm.joints };
-  const up = gravityAlignment(arm.gravity);
-  const size = Math.max(arm.joints.reduce((sum, each) => sum + Math.hypot(...each.translation), 0), 0.05);
-  const most = Math.max(...arm.joints.map((each) => each.mass));
-  const stroke = (factor) => String(factor * size);
-  const plate = h("path", { class: "plate" });
-  const back = h("path", { class: "links-edge", "stroke-width": stroke(0.075) });
-  const links = h("path", { class: "links", "stroke-width": stroke(0.055) });
-  const masses = arm.joints.map((each) => h("circle", { class: "mass", r: stroke(BALL * Math.cbrt(Math.max(each.mass, 0) / most)) }));
-  const axes = arm.joints.map((each) => h("path", { class: "axis", stroke: jointVar(each.joint), "stroke-width": stroke(0.036) }));
-  const element = h("svg", { class: "arm-sketch", role: "img", "aria-label": label }, plate, back, links, masses, axes);
-  const seen = { low: [Infinity, Infinity], high: [-Infinity, -Infinity] };
-  let shown = q, frame = 0;
-
-  const pose = (positions) => {
-    shown = positions;
-    const turned = frames(geometry, positions).map(({ rotation, origin, axis }) => ({
-      origin: times(up, origin), axis: times(up, axis), out: (vector) => times(up, times(rotation, vector)),
-    }));
-    const centres = turned.map(({ origin, out }, place) => add(origin, out(arm.joints[place].centre)));
-    const chain = [[0, 0, 0], ...turned.map((each) => each.origin), centres.at(-1)].map(project);
-    back.setAttribute("d", path(chain));
-    links.setAttribute("d", path(chain));
-    plate.setAttribute("d", `${path(circle(PLATE * size).map(project))}Z`);
-    centres.map(project).forEach(([x, y], place) => {
-      masses[place].setAttribute("cx", x);
-      masses[place].setAttribute("cy", y);
-    });
-    const half = AXIS * size;
-    turned.forEach(({ origin, axis }, place) => {
-      axes[place].setAttribute("d", path([-half, half].map((length) => project(add(origin, scaled(axis, length))))));
-    });
-    fitView([...chain, ...centres.map(project), ...circle(PLATE * size).map(project)]);
-  };
-  // the view only grows, so that a moving arm does not change its size
-  const fitView = (points) => {
-    for (const point of points) {
-      seen.low = seen.low.map((low, k) => Math.min(low, point[k]));
-      seen.high = seen.high.map((high, k) => Math.max(high, point[k]));
-    }
-    const room = ROOM * size + BALL * size;
-    const [x, y] = seen.low.map((low) => low - room);
-    const [width, height] = seen.high.map((high, k) => high + room - seen.low[k] + room);
-    element.setAttribute("viewBox", `${x} ${y} ${width} ${height}`);
-  };
-  const glide = (positions) => {
-    cancelAnimationFrame(frame);
-    if (REDUCED_MOTION.matches || !element.isConnected) return void pose(positions);
-    const from = shown;
-    const began = performance.now();
-    const step = (now) => {
-      const share = Math.min((now - began) / GLIDE_MS, 1);
-      pose(from.map((start, joint) => start + share * (positions[joint] - start)));
-      if (share < 1 && element.isConnected) frame = requestAnimationFrame(step);
-    };
-    frame = requestAnimationFrame(step);
-  };
-  pose(q);
-  return { element, pose, glide };
+/** An arm {gravity, joints} of `/v1/overview` at positions q. It glides to new positions; `key` is the version. label: for screen readers. */
+export function Sketch({ arm, q, label }) {
+  const shape = useMemo(() => shapeOf(arm), []);
+  const { size, most } = shape;
+  const { chain, centres, axes } = pose(shape, useGliding(q));
+  const plate = circle(PLATE * size).map(project);
+  const view = useView(size, [...chain, ...centres, ...plate]);
+  const ball = ({ mass }) => BALL * size * Math.cbrt(Math.max(mass, 0) / most);
+  return html`<svg class="arm-sketch" role="img" aria-label=${label} viewBox=${view}>
+    <path class="plate" d=${`${path(plate)}Z`} />
+    <path class="links-edge" stroke-width=${0.075 * size} d=${path(chain)} />
+    <path class="links" stroke-width=${0.055 * size} d=${path(chain)} />
+    ${shape.joints.map((each, place) => html`<circle class="mass" r=${ball(each)} cx=${centres[place][0]} cy=${centres[place][1]} />`)}
+    ${shape.joints.map((each, place) => html`<path class="axis" stroke=${jointVar(each.joint)} stroke-width=${0.036 * size} d=${path(axes[place])} />`)}
+  </svg>`;
 }
 
-/** Draw joints in a row, for estimators that do not learn an arm. */
-export function chain(n, label) {
+/** Joints in a row, for estimators that do not learn an arm. */
+export function Chain({ n, label }) {
   const spot = (joint) => [12 + (76 * joint) / Math.max(n - 1, 1), 50 - 16 * Math.sin((2.4 * joint) / Math.max(n - 1, 1))];
   const spots = Array.from({ length: n }, (_, joint) => spot(joint));
-  return h(
-    "svg",
-    { class: "arm-sketch", role: "img", "aria-label": label, viewBox: "0 0 100 80" },
-    h("path", { class: "links unknown", "stroke-width": "2", d: path(spots) }),
-    spots.map(([x, y], joint) => h("circle", { cx: x, cy: y, r: "4.2", fill: jointVar(joint) })),
-  );
+  return html`<svg class="arm-sketch" role="img" aria-label=${label} viewBox="0 0 100 80">
+    <path class="links unknown" stroke-width="2" d=${path(spots)} />
+    ${spots.map(([x, y], joint) => html`<circle cx=${x} cy=${y} r="4.2" fill=${jointVar(joint)} />`)}
+  </svg>`;
+}
+
+/** Return positions that follow q within GLIDE_MS; at once if reduced motion is set. */
+function useGliding(q) {
+  const [shown, setShown] = useState(q);
+  const last = useRef(q);
+  useEffect(() => {
+    const from = last.current, began = performance.now();
+    let frame = 0;
+    const show = (positions) => setShown((last.current = positions));
+    const step = (now) => {
+      const share = Math.min(Math.max(now - began, 0) / GLIDE_MS, 1);
+      show(from.map((start, joint) => start + share * (q[joint] - start)));
+      if (share < 1) frame = requestAnimationFrame(step);
+    };
+    if (REDUCED_MOTION.matches || from.length !== q.length) show(q);
+    else if (from.some((each, joint) => each !== q[joint])) frame = requestAnimationFrame(step);
+    return () => cancelAnimationFrame(frame);
+  }, [JSON.stringify(q)]);
+  return shown.length === q.length ? shown : q;
+}
+
+/** Return the view box around all points so far: it only grows, so that a moving arm keeps its size. */
+function useView(size, points) {
+  const box = useRef({ low: [Infinity, Infinity], high: [-Infinity, -Infinity] }).current;
+  const room = (ROOM + BALL) * size;
+  for (const point of points) {
+    box.low = box.low.map((low, k) => Math.min(low, point[k]));
+    box.high = box.high.map((high, k) => Math.max(high, point[k]));
+  }
+  return [...box.low.map((low) => low - room), ...box.high.map((high, k) => high - box.low[k] + 2 * room)].join(" ");
+}
+
+function shapeOf({ gravity, joints }) {
+  const size = Math.max(joints.reduce((sum, each) => sum + Math.hypot(...each.translation), 0), 0.05);
+  return { joints, size, up: gravityAlignment(gravity), most: Math.max(...joints.map((each) => each.mass)) };
+}
+
+/** Return the projected points of an arm at positions q. */
+function pose({ joints, size, up }, q) {
+  const turned = frames({ order: joints.map((each) => each.joint), joints }, q).map(({ rotation, origin, axis }) => ({
+    origin: times(up, origin), axis: times(up, axis), out: (vector) => times(up, times(rotation, vector)),
+  }));
+  const centres = turned.map(({ origin, out }, place) => add(origin, out(joints[place].centre)));
+  const ends = ({ origin, axis }) => [-AXIS * size, AXIS * size].map((length) => project(add(origin, scaled(axis, length))));
+  return {
+    chain: [[0, 0, 0], ...turned.map((each) => each.origin), centres.at(-1)].map(project),
+    centres: centres.map(project),
+    axes: turned.map(ends),
+  };
 }
 
 /** Project a point: right, and down. */

@@ -1,32 +1,34 @@
 // Queued and running jobs with their progress, and the last finished ones.
 
-import { h, refresh } from "../../dom.js";
+import { Badge, Card, Link, Progress } from "../../components.js";
 import { ago, seconds } from "../../format.js";
-import { badge, card, link, progress } from "../../ui.js";
+import { html } from "../../preact.js";
+import { ACTIVE, stage } from "../job/words.js";
 
 const MAX_FINISHED = 3;
 
-/** Show the jobs. */
-export function jobBoard(place, jobs) {
-  const active = jobs.filter((job) => job.state === "running" || job.state === "queued");
-  const shown = [...active, ...jobs.filter((job) => !active.includes(job)).slice(0, MAX_FINISHED)];
-  const list = h("ul", { class: "rows" }, shown.map(row));
-  refresh(place, shown.length ? card("Training", list, h("p", {}, link("All jobs", "#/jobs"))) : null);
+/** The active jobs and the last finished ones. */
+export function Jobs({ jobs }) {
+  const active = jobs.filter((job) => ACTIVE.has(job.state));
+  const shown = [...active, ...jobs.filter((job) => !ACTIVE.has(job.state)).slice(0, MAX_FINISHED)];
+  if (!shown.length) return null;
+  return html`<${Card} title="Training">
+    <ul class="rows">${shown.map((job) => html`<${Row} key=${job.id} job=${job} />`)}</ul>
+    <p><${Link} to="#/jobs">All jobs<//></p>
+  <//>`;
 }
 
-function row(job) {
-  return h(
-    "li",
-    { "data-key": job.id },
-    h("div", { class: "row" }, badge(job.state), link(`${job.model}, ${job.estimator}`, `#/jobs/${job.id}`), h("span", { class: "muted" }, status(job))),
-    job.state === "running" ? progress(job.progress.fraction, `Progress of ${job.model}`) : null,
-  );
+function Row({ job }) {
+  return html`<li data-key=${job.id}>
+    <div class="row"><${Badge} state=${job.state} /> <${Link} to=${`#/jobs/${job.id}`}>${job.model}, ${job.estimator}<//> <span class="muted">${status(job)}</span></div>
+    ${job.state === "running" && html`<${Progress} fraction=${job.progress.fraction} label=${`Progress of ${job.model}`} />`}
+  </li>`;
 }
 
 function status(job) {
-  const { stage, remaining_s: left } = job.progress;
+  const left = job.progress.remaining_s;
   if (job.state === "queued") return `queued ${ago(job.created_at)}`;
-  if (job.state === "running") return left ? `${stage}, up to ${seconds(left)} left` : stage;
+  if (job.state === "running") return left ? `${stage(job)}, up to ${seconds(Math.ceil(left))} left` : stage(job);
   if (job.state === "succeeded") return `version ${job.version}${job.verdict ? `: ${job.verdict.label}` : ""}, ${ago(job.finished_at)}`;
   return `${job.error?.message ?? ""} ${ago(job.finished_at)}`.trim();
 }
