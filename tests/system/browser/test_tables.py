@@ -154,3 +154,15 @@ def test_filters_of_models_and_jobs_survive_updates(
     expect(table.locator("tbody tr")).to_have_count(1)
     expect(page.get_by_role("searchbox")).to_have_value("three se")
     assert audit(page) == []
+
+
+def test_list_of_jobs_fits_a_desktop_window_and_shows_result_and_time(
+    windows: Visit, dashboard: Dashboard, rows: dict[str, Any]
+) -> None:
+    page = windows(dashboard.server.url, size=(1440, 900)).open("#/jobs")
+    table = page.get_by_role("table", name="Jobs", exact=True)
+    row = table.locator(f'tr[data-key="{dashboard.job["id"]}"]')
+    expect(row).to_contain_text(re.compile(r"version 1 after \d+"))
+    expect(row).to_contain_text("ago")
+    around = page.get_by_role("region", name="Jobs", exact=True).last
+    assert around.evaluate("(each) => each.scrollWidth - each.clientWidth") <= 0
