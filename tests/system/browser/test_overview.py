@@ -201,7 +201,7 @@ def test_models_that_need_attention_come_first(visitor: Visitor, windows: Visit,
     ]
     changed(page, name, alarm=alarm, payloads=checked, idle_s=5)
     expect(place).to_contain_text("Much is new.")
-    expect(place).to_contain_text("cell-1 checking payload")
+    expect(place).to_contain_text("cell-1 contact")
     expect(place).to_contain_text("cell-2 no payload")
     phone = windows(dashboard.server.url, size=PHONE, scheme="dark", touch=True)
     phone.open("#/")

@@ -75,11 +75,13 @@ def ready(visitor: Visitor, name: str) -> None:
     if name == "overview":
         expect(page.locator(f".robot[data-key={MODEL}] .course")).to_be_attached()
     if name == "live":
-        page.locator(".trace.large").scroll_into_view_if_needed()  # invisible plots are not updated
+        page.locator(".trace").first.scroll_into_view_if_needed()  # invisible plots are not updated
         expect(page.get_by_role("region", name="Innovation").locator(".linked")).to_be_attached()
         expect(page.get_by_role("region", name="External torque")).to_be_visible()
         expect(page.get_by_role("region", name="Payload").get_by_text("kg")).to_be_visible()
-        expect(page.get_by_role("img", name="over the last 30 seconds, large")).to_be_attached()
+        expect(page.get_by_role("img", name="over the last 30 seconds")).to_have_count(
+            8
+        )  # seven joints, the innovation
     if name == "live-quiet":
         expect(page.get_by_text("lipserve stream")).to_be_visible()
     if name == "data-set-signals":

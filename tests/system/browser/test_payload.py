@@ -96,7 +96,7 @@ def test_payload_is_estimated_and_included_in_predictions(windows: Visit, dashbo
     expect(forces).to_contain_text("no external torque")
     expect(page.get_by_role("region", name="Alarms")).to_contain_text("more than in training")
     marks = page.locator(".linked .mark[data-word=payload]")
-    expect(marks).to_have_count(9)  # one large, one a joint, the innovation
+    expect(marks).to_have_count(8)  # one a joint, the innovation
     for mark in marks.all():  # at the start of the payload, not at its detection
         assert mark.evaluate("(mark) => parseFloat(mark.style.left)") == pytest.approx(10 * (10 - END + TAKEN), abs=3)
     assert audit(page) == []

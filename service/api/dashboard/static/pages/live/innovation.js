@@ -1,56 +1,50 @@
 // Plot of the innovation in standard deviations, with marks of rejected and novel rows.
 
 import { css } from "../../colours.js";
-import { h, replace } from "../../dom.js";
+import { Card } from "../../components.js";
 import { shortNames } from "../../format.js";
-import { line, plot } from "../../plots.js";
-import { card, explanation } from "../../ui.js";
+import { line } from "../../plots.js";
+import { html } from "../../preact.js";
 import { CODES, NOVEL } from "./codes.js";
+import { Explanation } from "./explanation.js";
+import { LivePlot } from "./live_plot.js";
 import { innovationOf } from "./scores.js";
-import { withGaps, HALF_WIDTH, span, thin } from "./torque.js";
+import { HALF_WIDTH, span, thin, withGaps } from "./torque.js";
 
 const HEIGHT = 300;
 const MIN_RANGE_STD = 4;
 const MAX_RANGE_STD = 12;
 const MAX_MARKS = 150; // of each kind
 
-/** Create the plot. view: {window}. Returns {draw(rows, status, joint)}; joint: highlighted joint. */
-export function innovation(place, joints, view, linked, signal) {
+/** The innovation of all joints; joint: highlighted one; threshold: of contacts, in standard deviations. */
+export function Innovation({ shown, joints, window, threshold, joint, linked }) {
+  const range = [-span(shown, window), 0];
+  const label = `Innovation of all joints over the last ${-range[0]} seconds, with marks of rejected rows`;
+  return html`<${Card} title="Innovation">
+    <${LivePlot} make=${() => innovation(shown, joints, range, threshold, joint)} inputs=${[shown, joint]} height=${HEIGHT} label=${label} linked=${linked} />
+    <${Explanation}>Measured − predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rejected rows and rows outside the training data, at the joint with the largest innovation. Values beyond ± ${MAX_RANGE_STD} are drawn at ± ${MAX_RANGE_STD}.<//>
+  <//>`;
+}
+
+function innovation(rows, joints, range, threshold, highlighted) {
   const short = shortNames(joints);
-  const element = h("div", { style: `height: ${HEIGHT}px` });
-  const hint = `Measured − predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rejected rows and rows outside the training data, at the joint with the largest innovation. Values beyond ± ${MAX_RANGE_STD} are drawn at ± ${MAX_RANGE_STD}.`;
-  replace(place, card("Innovation", element, explanation(hint)));
-  let made = null;
-  return {
-    async draw(rows, status, shown) {
-      if (signal.aborted) return;
-      const worst = rows.map(largestInnovation);
-      const top = Math.min(MAX_RANGE_STD, Math.max(MIN_RANGE_STD, 1.1 * worst.reduce((most, z) => Math.max(most, Math.abs(z)), 0)));
-      const clip = (z) => (z === null ? null : Math.max(-top, Math.min(top, z)));
-      const thinned = thin(rows);
-      const x = withGaps(thinned, (row) => row.x);
-      const curves = joints.map((_name, joint) =>
-        line(x, withGaps(thinned, (row) => clip(innovationOf(row, joint))), short[joint], joint, { line: { width: joint === shown ? 2.2 : 0.8 }, showlegend: false }),
-      );
-      const traces = [...curves, ...marks(rows, worst, clip)];
-      const range = [-span(rows, view.window), 0];
-      const layout = {
-        y: "σ", height: HEIGHT, margin: { l: 52, r: 8, t: 8, b: 40 }, hovermode: false, dragmode: false,
-        xaxis: { range, zeroline: false, ticksuffix: " s", automargin: false },
-        yaxis: { range: [-1.05 * top, 1.05 * top], automargin: false },
-        showlegend: true, // for the marks only: the plots above name the joint colours
-        legend: { orientation: "h", y: -0.16, yanchor: "top", itemclick: false, itemdoubleclick: false },
-        shapes: limits(status.contact_threshold, top),
-      };
-      const label = `Innovation of all joints over the last ${-range[0]} seconds, with marks of rejected rows`;
-      element.setAttribute("aria-label", label);
-      if (made) await made.react(traces, layout);
-      else {
-        made = await plot(element, traces, layout, { label, signal });
-        if (!signal.aborted) linked.add(element);
-      }
-    },
+  const worst = rows.map(largestInnovation);
+  const top = Math.min(MAX_RANGE_STD, Math.max(MIN_RANGE_STD, 1.1 * worst.reduce((most, z) => Math.max(most, Math.abs(z)), 0)));
+  const clip = (z) => (z === null ? null : Math.max(-top, Math.min(top, z)));
+  const thinned = thin(rows);
+  const x = withGaps(thinned, (row) => row.x);
+  const curves = joints.map((_name, joint) =>
+    line(x, withGaps(thinned, (row) => clip(innovationOf(row, joint))), short[joint], joint, { line: { width: joint === highlighted ? 2.2 : 0.8 }, showlegend: false }),
+  );
+  const layout = {
+    y: "σ", height: HEIGHT, margin: { l: 52, r: 8, t: 8, b: 40 }, hovermode: false, dragmode: false,
+    xaxis: { range, zeroline: false, ticksuffix: " s", automargin: false },
+    yaxis: { range: [-1.05 * top, 1.05 * top], automargin: false },
+    showlegend: true, // for the marks only: the plots above name the joint colours
+    legend: { orientation: "h", y: -0.16, yanchor: "top", itemclick: false, itemdoubleclick: false },
+    shapes: limits(threshold, top),
   };
+  return { traces: [...curves, ...marks(rows, worst, clip)], layout };
 }
 
 /** Return the largest innovation of a row; 0 if nothing was predicted. */

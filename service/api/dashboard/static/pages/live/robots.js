@@ -1,31 +1,46 @@
 // List of the streaming robots with their models and states.
 
 import { get, pages, path } from "../../api.js";
-import { h, refresh, replace } from "../../dom.js";
-import { ago, kilograms, percent, scientific, sentence } from "../../format.js";
-import { badge, card, empty, heading, link, repeat, table } from "../../ui.js";
+import { Await, Badge, Card, Empty, Heading, Link, Table, useRead } from "../../components.js";
+import { ago, kilograms, percent, seconds, sentence } from "../../format.js";
+import { html } from "../../preact.js";
+import { VerdictBadge } from "../../verdicts.js";
 
 const PERIOD_S = 3;
 const MAX_MODELS = 100;
 const MAX_DETAILED = 20; // models to read streams of, the most recent first
+const LIVE_S = 10;
+const COLUMNS = [
+  { label: "Robot", cell: ({ model, stream }) => html`<${Link} to=${address(model.name)}>${stream ?? "several"}<//>` },
+  { label: "State", cell: state },
+  { label: "Model", cell: ({ model }) => html`<${Link} to=${address(model.name)}>${model.name}<//>` },
+  { label: "Verdict", cell: ({ model }) => html`<${VerdictBadge} verdict=${model.verdict} />` },
+  { label: "Last row", cell: ({ heard }) => (heard === null ? "–" : ago(heard)) },
+  { label: "Learning", cell: ({ model: { lag_s: lag } }) => (lag === null ? "–" : lag < 1 ? "up to date" : `${seconds(lag)} behind`) },
+  { label: "95 % coverage", numeric: true, cell: coverage },
+  { label: "Payload", cell: payload },
+  { label: "Last alarm", cell: ({ model: { alarm } }) => (alarm ? `${alarm.kind}, ${ago(alarm.at)}` : "none") },
+];
 
-/** Show the list and update it while the page is visible; throw an error of the first update. */
-export async function robots(view, signal) {
-  const place = h("div", {}), stale = h("div", { role: "status" });
-  let isShown = false;
-  const update = async () => {
+/** The list, read again while the page is visible. */
+export function Robots() {
+  const reading = useRead(async (signal) => {
     const models = await pages("/v1/overview", MAX_MODELS, {}, signal);
-    const found = await streams(models, signal);
-    if (signal.aborted) return;
-    refresh(stale);
-    refresh(place, shown(models, found));
-    if (!isShown) replace(view, heading("Live"), stale, place);
-    isShown = true;
-  };
-  await update();
-  repeat(PERIOD_S, () => update().catch((error) => {
-    if (!signal.aborted) refresh(stale, h("p", { class: "banner" }, `Out of date. ${sentence(error.message)} Retrying.`));
-  }), signal);
+    return { models, found: await streams(models, signal) };
+  }, [], PERIOD_S);
+  const { value, error } = reading;
+  return html`<${Heading} text="Live" />
+    ${value && error && html`<p class="banner" role="status">Out of date. ${sentence(error.message)} Retrying.</p>`}
+    <${Await} reading=${value ? { ...reading, error: null } : reading}>${(seen) => html`<${Shown} ...${seen} />`}<//>`;
+}
+
+function Shown({ models, found }) {
+  if (!models.length) return html`<${Empty} text="No models yet. Upload a recording of your robot, then train a model on it."><${Link} to="#/data" kind="primary">Upload a recording<//><//>`;
+  const silent = models.filter((each) => each.idle_s === null);
+  const none = html`No streams yet. Try a simulated robot: <code>lipserve stream ${models[0].name} --simulate panda --learn</code>`;
+  return html`
+    ${found.length ? html`<${Card} title="Robots"><${Table} columns=${COLUMNS} rows=${found} caption="Coverage: smallest of the joints in the last hour" identity=${({ model, stream }) => `${model.name}/${stream}`} /><//>` : html`<${Empty} text=${none} />`}
+    ${silent.length > 0 && html`<${Card} title="Models without a stream"><ul class="names">${silent.map(({ name }) => html`<li key=${name}><${Link} to=${address(name)}>${name}<//></li>`)}</ul><//>`}`;
 }
 
 /** Return the address of a model's live page. */
@@ -53,53 +68,21 @@ async function streams(models, signal) {
   return known.sort((one, other) => Date.parse(other.heard ?? 0) - Date.parse(one.heard ?? 0));
 }
 
-const LIVE_S = 10;
-
-function shown(models, found) {
-  if (!models.length) {
-    const hint = "No models yet. Upload a recording of your robot, then train a model on it.";
-    return empty(hint, link("Upload a recording", "#/data", "primary"));
-  }
-  const silent = models.filter((each) => each.idle_s === null);
-  return [
-    found.length ? card("Robots", list(found)) : empty(["No streams yet. Try a simulated robot: ", h("code", {}, `lipserve stream ${models[0].name} --simulate panda --learn`)]),
-    silent.length ? card("Models without a stream", h("ul", { class: "names" }, silent.map(({ name }) => h("li", { "data-key": name }, link(name, address(name)))))) : null,
-  ];
-}
-
-function list(found) {
-  return table(
-    [
-      { label: "Robot", cell: ({ model, stream }) => link(stream ?? "several", address(model.name)) },
-      { label: "State", cell: state },
-      { label: "Model", cell: ({ model }) => link(model.name, address(model.name)) },
-      { label: "Last row", cell: ({ heard }) => (heard === null ? "–" : ago(heard)) },
-      { label: "Max nMSE", numeric: true, cell: ({ model }) => figure(model, "nmse", Math.max, scientific) },
-      { label: "Min 95 % coverage", numeric: true, cell: ({ model }) => figure(model, "coverage", Math.min, percent) },
-      { label: "Payload", cell: payloadOf },
-      { label: "Last alarm", cell: ({ model: { alarm } }) => (alarm ? `${alarm.kind}, ${ago(alarm.at)}` : "none") },
-    ],
-    found,
-    { caption: "Figures: worst joint of the model in the last hour", key: ({ model, stream }) => `${model.name}/${stream}` },
-  );
-}
-
 function state({ model, stream, heard }) {
-  const payload = model.payloads?.find((each) => each.stream_id === stream);
+  const load = model.payloads?.find((each) => each.stream_id === stream);
   const live = heard !== null && Date.now() - Date.parse(heard) < 1000 * LIVE_S;
-  if (model.held) return badge("paused", "warn");
-  if (model.failure) return badge("learning failed", "bad");
-  if (!live) return badge("idle", "plain");
-  if (payload?.state === "contact") return badge("contact", "warn");
-  return badge("live", "good");
+  if (model.held) return html`<${Badge} state="paused" />`;
+  if (model.failure) return html`<${Badge} state="learning failed" kind="bad" />`;
+  if (!live) return html`<${Badge} state="idle" />`;
+  return load?.state === "contact" ? html`<${Badge} state="contact" kind="warn" />` : html`<${Badge} state="live" kind="good" />`;
 }
 
-function payloadOf({ model, stream }) {
-  const mass = model.payloads?.find((each) => each.stream_id === stream)?.mass;
-  return mass ? kilograms(mass) : "–";
+function payload({ model, stream }) {
+  const load = model.payloads?.find((each) => each.stream_id === stream);
+  return load?.mass ? kilograms(load.mass) : "–";
 }
 
-function figure({ recent }, name, worst, format) {
-  const known = (recent?.[name] ?? []).filter((each) => each !== null);
-  return known.length ? format(worst(...known)) : "–";
+function coverage({ model: { recent } }) {
+  const known = (recent?.coverage ?? []).filter((each) => each !== null);
+  return known.length ? percent(Math.min(...known)) : "–";
 }

@@ -1,106 +1,52 @@
-// Plots of the measured and predicted torque with 95 % intervals: one large plot, and a small one for each joint.
+// The measured and predicted torque of each joint with 95 % intervals, each joint on its own scale.
 
 import { jointVar } from "../../colours.js";
-import { h, replace } from "../../dom.js";
+import { Card } from "../../components.js";
 import { number, shortNames, torqueUnit } from "../../format.js";
-import { line, plot } from "../../plots.js";
-import { card } from "../../ui.js";
-import { recentInnovations, largestJoint } from "./scores.js";
+import { line } from "../../plots.js";
+import { html } from "../../preact.js";
+import { LivePlot } from "./live_plot.js";
 
 export const HALF_WIDTH = 1.96;
 const MAX_POINTS = 300;
-const SMALL = { height: 110, margin: { l: 34, r: 4, t: 4, b: 16 }, most: 120 };
-const LARGE = { height: 320, margin: { l: 52, r: 8, t: 8, b: 28 }, most: MAX_POINTS };
+const SMALL = { height: 130, most: 150, ticks: 4 }, LARGE = { height: 320, most: MAX_POINTS, ticks: 8 };
 const FULL_BAR_STD = 8; // innovation that fills the bar of a joint
 
-/**
- * Create the plots. view: {window, joint, cursor}; joint null: the one with the largest recent innovation;
- * pick(joint): called when a joint is selected. Returns {draw(rows), point()}; point() shows the values at the cursor.
- */
-export function torque(place, joints, types, view, linked, { pick, signal }) {
-  const short = shortNames(joints);
-  const large = figure(h("h3", { class: "joint" }), LARGE, "large");
-  const made = joints.map((name, joint) => {
-    const button = h("button", { type: "button", class: "joint", style: `--own: ${jointVar(joint)}`, onclick: () => pick(view.joint === joint ? null : joint) }, short[joint]);
-    button.setAttribute("aria-label", `Show ${name} large`);
-    return { ...figure(button, SMALL, "small"), name, joint, button };
-  });
-  const watch = new IntersectionObserver((entries) => {
-    for (const entry of entries) [large, ...made].find((each) => each.element === entry.target).seen = entry.isIntersecting;
-  }, { rootMargin: "300px 0px" });
-  [large, ...made].forEach((each) => watch.observe(each.element));
-  signal.addEventListener("abort", () => watch.disconnect());
-  const why = h("span", { class: "muted" });
-  large.head.append(why);
-  replace(
-    place,
-    card(
-      "Torque",
-      large.element,
-      h("p", { class: "hint" }, swatch("border-top: 3px solid var(--measured)"), "measured  ", swatch("border-top: 3px solid var(--predicted)"), "predicted before learning  ", swatch("height: 0.8em; background: var(--predicted); opacity: 0.3"), "95 % interval of measurements: ± 1.96 √(std² + noise²)  ", h("b", { "aria-hidden": "true", style: "color: var(--contact)" }, "× "), "rejected (at the edge: outside the plot)"),
-      h("div", { class: "multiples" }, made.map((each) => each.element)),
-    ),
-  );
-
-  let shown = null, chosen = false, last = [];
-  const draw = async (each, joint, range, label) => {
-    const rows = thin(last, each.size.most);
-    const reach = axisRange(rows, joint);
-    const traces = [...curves(rows, joint), rejectedMarks(last, joint, reach)];
-    const small = each.size === SMALL;
-    const layout = {
-      y: small ? "" : torqueUnit(types[joint]),
-      height: each.size.height,
-      showlegend: false,
-      hovermode: false,
-      dragmode: false,
-      margin: each.size.margin,
-      xaxis: { range, zeroline: false, ticksuffix: " s", nticks: small ? 4 : 8, automargin: false, tickfont: small ? { size: 10 } : {} },
-      yaxis: { range: reach, nticks: small ? 4 : 8, automargin: false, tickfont: small ? { size: 10 } : {} },
-    };
-    each.plot.setAttribute("aria-label", label);
-    if (each.made) return each.made.react(traces, layout);
-    each.made = await plot(each.plot, traces, layout, { label, signal });
-    if (!signal.aborted) linked.add(each.plot);
+/** A plot of each joint; the picked one is large. cursor: time in s, or null; pick(joint): called when a joint is selected. */
+export function Torque({ shown, joints, types, window, scores, largest, picked, cursor, linked, pick }) {
+  const short = shortNames(joints), at = cursor === null ? null : closest(shown, cursor);
+  const range = [-span(shown, window), 0];
+  const value = (joint) => {
+    if (!at) return `${number(scores[joint], 2)} σ${joint === largest ? ", largest" : ""}`;
+    const [measured, predicted] = [at.tau[joint], at.mean[joint]].map((each) => (each === null ? "–" : each.toFixed(2)));
+    return joint === picked ? `measured ${measured}, predicted ${predicted} ${torqueUnit(types[joint])}` : `${measured} | ${predicted}`;
   };
-  const point = () => {
-    const at = view.cursor === null ? null : closest(last, view.cursor);
-    large.value.textContent = at ? values(at, shown, torqueUnit(types[shown])) : "";
-    for (const each of made) each.value.textContent = at ? values(at, each.joint, "") : `${number(each.score ?? 0, 2)} σ`;
-  };
-  return {
-    point,
-    async draw(rows) {
-      last = rows;
-      const scores = recentInnovations(rows, joints);
-      shown = view.joint ?? largestJoint(scores, chosen ? null : shown);
-      chosen = view.joint !== null;
-      large.title.textContent = short[shown];
-      large.element.style.setProperty("--own", jointVar(shown));
-      why.textContent = view.joint === null ? `largest recent innovation: ${number(scores[shown], 2)} σ` : "selected";
-      for (const each of made) {
-        each.score = scores[each.joint];
-        each.element.classList.toggle("largest", each.joint === shown);
-        each.button.setAttribute("aria-pressed", String(view.joint === each.joint));
-        each.element.style.setProperty("--of", String(Math.min(scores[each.joint] / FULL_BAR_STD, 1)));
-        each.element.classList.toggle("far", scores[each.joint] > FULL_BAR_STD);
-      }
-      point();
-      const range = [-span(rows, view.window), 0];
-      const text = (name) => `${name}: torque measured and predicted over the last ${-range[0]} seconds`;
-      if (large.seen || !large.made) await draw(large, shown, range, `${text(joints[shown])}, large`);
-      for (const each of made) if ((each.seen || !each.made) && !signal.aborted) await draw(each, each.joint, range, text(each.name));
-      return shown;
-    },
-  };
+  const kinds = (joint) => ["trace", joint === picked ? "large" : "small", joint === largest && "largest", scores[joint] > FULL_BAR_STD && "far"].filter(Boolean).join(" ");
+  const one = (name, joint) => html`<div key=${name} class=${kinds(joint)} style=${{ "--own": jointVar(joint), "--of": Math.min(scores[joint] / FULL_BAR_STD, 1) }}>
+    <div class="head">
+      <button type="button" class="joint" aria-pressed=${String(joint === picked)} aria-label=${`Show ${name} large`} onClick=${() => pick(joint)}>${short[joint]}</button>
+      <span class="value">${value(joint)}</span>
+    </div>
+    <${Plot} shown=${shown} joint=${joint} unit=${torqueUnit(types[joint])} range=${range} size=${joint === picked ? LARGE : SMALL} linked=${linked} label=${`${name}: torque measured and predicted over the last ${-range[0]} seconds`} />
+  </div>`;
+  return html`<${Card} title="Torque">
+    <p class="hint legend"><span class="measured">measured</span> <span class="predicted">predicted before learning, in the colour of the joint</span> <span class="interval">95 % interval of measurements</span> <span class="rejected">rejected (at the edge: outside the plot)</span> σ: largest innovation of the last seconds, in standard deviations</p>
+    <div class="multiples">${joints.map(one)}</div>
+  <//>`;
 }
 
-/** Create the frame of a plot: a head with name and value, and a place of fixed size. */
-function figure(title, size, kind) {
-  const value = h("span", { class: "value" });
-  const head = h("div", { class: "head" }, title, value);
-  const place = h("div", { style: `height: ${size.height}px` });
-  return { title, value, head, size, plot: place, seen: false, made: null, element: h("div", { class: `trace ${kind}` }, head, place) };
+function Plot({ shown, joint, unit, range, size, linked, label }) {
+  const make = () => {
+    const rows = thin(shown, size.most), reach = axisRange(rows, joint);
+    const tickfont = { size: size === SMALL ? 11 : 12.5 };
+    const layout = {
+      y: unit, height: size.height, showlegend: false, hovermode: false, dragmode: false, margin: { l: 52, r: 6, t: 6, b: 20 },
+      xaxis: { range, zeroline: false, ticksuffix: " s", nticks: size.ticks, automargin: false, tickfont },
+      yaxis: { range: reach, nticks: size.ticks, automargin: false, tickfont },
+    };
+    return { traces: [...curves(rows, joint), rejectedMarks(shown, joint, reach)], layout };
+  };
+  return html`<${LivePlot} make=${make} inputs=${[shown, size]} height=${size.height} label=${label} linked=${linked} />`;
 }
 
 /** Return the seconds of a window that the x axis shows: fewer while there are only a few rows. */
@@ -112,11 +58,6 @@ export function span(rows, window) {
 /** Return the row nearest to x; null if there are none. */
 export function closest(rows, x) {
   return rows.reduce((best, row) => (best === null || Math.abs(row.x - x) < Math.abs(best.x - x) ? row : best), null);
-}
-
-function values({ tau, mean }, joint, unit) {
-  const [measured, predicted] = [tau[joint], mean[joint]].map((each) => (each === null ? "–" : unit ? each.toFixed(2) : number(each, 2)));
-  return unit ? `measured ${measured}, predicted ${predicted} ${unit}` : `${measured} | ${predicted}`;
 }
 
 /** Thin rows for a line; keep the first row after a gap and the rejected rows. */
@@ -136,7 +77,7 @@ function curves(rows, joint) {
   const measured = withGaps(rows, (row) => (row.code === "limit" ? null : row.tau[joint]));
   return [
     ribbon(rows.filter((row) => row.mean[joint] !== null), joint),
-    line(x, withGaps(rows, (row) => row.mean[joint]), "predicted", "predicted"),
+    line(x, withGaps(rows, (row) => row.mean[joint]), "predicted", joint),
     line(x, measured, "measured", "measured", { line: { width: 1.2 } }),
   ];
 }
@@ -153,7 +94,7 @@ function ribbon(rows, joint) {
   return {
     x: around((row) => row.x, (row) => row.x),
     y: around((row) => edge(row, -1), (row) => edge(row, 1)),
-    mode: "lines", type: "scatter", fill: "toself", filled: true, colour: "predicted", line: { width: 0 }, hoverinfo: "skip", name: "95 %",
+    mode: "lines", type: "scatter", fill: "toself", filled: true, colour: joint, line: { width: 0 }, hoverinfo: "skip", name: "95 %",
   };
 }
 
@@ -186,8 +127,4 @@ function axisRange(rows, joint) {
   if (!(low <= high)) return [-1, 1];
   const span = Math.max(high - low, 1e-3);
   return [Math.max(Math.min(all[0], low), low - span) - 0.05 * span, Math.min(Math.max(all[1], high), high + span) + 0.05 * span];
-}
-
-function swatch(style) {
-  return h("span", { "aria-hidden": "true", style: `display: inline-block; width: 1.4em; vertical-align: middle; margin: 0 0.3em 0 0.6em; ${style}` });
 }

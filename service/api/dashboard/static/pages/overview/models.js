@@ -82,7 +82,7 @@ function Stream({ model: { payloads, lag_s: lag, recent }, names }) {
 }
 
 function payloadText({ state, mass }) {
-  return state === "contact" && mass === null ? "checking payload" : kilograms(mass);
+  return state === "contact" && mass === null ? "contact" : kilograms(mass);
 }
 
 /** What requires attention. */
