@@ -112,16 +112,16 @@ def test_lines_have_gaps_between_episodes(visitor: Visitor, dashboard: Dashboard
 
 def test_form_offers_every_estimator(visitor: Visitor) -> None:
     page = visitor.open("#/train")
-    page.get_by_text("More estimators").click()
+    page.get_by_text("Options", exact=True).click()
     assert [each.get_attribute("value") for each in page.get_by_role("radio").all()] == list(
         dict.fromkeys(["auto", "rigid-body", "rigid-body+local", "lip-chain", "rigid-body+lip-chain", *ESTIMATORS])
     )
     for name in ESTIMATORS:
         page.locator(f'input[type=radio][value="{name}"]').check()
         robot = page.get_by_label("Robot", exact=True)
-        expect(robot).to_be_visible() if name in ROBOT_ESTIMATORS else expect(robot).to_be_hidden()
+        expect(robot).to_be_enabled() if name in ROBOT_ESTIMATORS else expect(robot).to_be_disabled()
     page.get_by_role("radio", name="auto (default)").check()
-    expect(page.get_by_label("Robot", exact=True)).to_be_visible()
+    expect(page.get_by_label("Robot", exact=True)).to_be_enabled()
     page.get_by_label("Model name").fill("refused")
     page.get_by_role("button", name="Start training").click()
     expect(page.get_by_role("alert")).to_contain_text("Choose at least one recording")

@@ -72,9 +72,8 @@ def trained(visitor: Visitor) -> None:
     page.get_by_label("Model name").fill("my-arm")
     expect(page.get_by_label(f"Train on {NAME}")).to_be_checked()
     assert audit(page) == []
-    page.get_by_text("More estimators").click()
+    page.get_by_text("Options", exact=True).click()
     page.locator('input[type=radio][value="lip-chain"]').check()
-    page.get_by_text("Advanced options").click()
     for label, value in OPTIONS.items():
         page.get_by_label(label, exact=True).fill(str(value))
     page.get_by_role("button", name="Start training").click()

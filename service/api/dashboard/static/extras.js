@@ -2,6 +2,7 @@
 
 import { get } from "./api.js";
 import { h, replace } from "./dom.js";
+import { html, useEffect, useState } from "./preact.js";
 
 let pending = null;
 
@@ -26,4 +27,19 @@ export function missingExtraHint(extra, ...controls) {
   };
   readHealth().then(show, () => {}); // other parts of the page report that the service does not answer
   return hint;
+}
+
+/** Return an extra {gives, install} if the service lacks it; null if it has it, or before this is known. */
+export function useMissing(extra) {
+  const [missing, setMissing] = useState(null);
+  useEffect(() => {
+    // other parts of the page report that the service does not answer
+    readHealth().then((health) => setMissing(health.missing.find((each) => each.extra === extra) ?? null), () => {});
+  }, [extra]);
+  return missing;
+}
+
+/** A hint how to install an extra, from `useMissing`. */
+export function MissingExtra({ missing }) {
+  return missing && html`<p class="hint">To ${missing.gives}, install on the service's machine: <code>${missing.install}</code></p>`;
 }

@@ -1,8 +1,8 @@
-// Choice of the estimator, with an explanation of each: two are visible, the others under “More estimators”.
+// Choice of the estimator, with an explanation of each.
 
-import { h } from "../../dom.js";
+import { html } from "../../preact.js";
 
-/** [name, description, whether it can use a robot's URDF]. */
+/** [name, description, whether it can start from a robot]. */
 export const ESTIMATORS = [
   ["auto", "Compares rigid-body and lip-chain on held-out motion. Chooses the simplest unless another one is significantly better. Takes up to three minutes.", true],
   ["rigid-body", "Rigid bodies: learns joint axes, masses and friction. For stiff arms.", true],
@@ -14,31 +14,21 @@ export const ESTIMATORS = [
   ["gip", "Baseline of the paper: a geometrically inspired polynomial.", false],
   ["lse", "Baseline of the paper: one squared exponential Lagrangian.", false],
 ];
-const VISIBLE_COUNT = 2;
 
-/** Create radio buttons; onchange(name, usesRobot). Returns {element, robot(name)}, which shows the robot that rigid-body starts from, "" for none. */
-export function estimatorChoice(onchange) {
-  const startRobot = h("span", {});
-  const made = ESTIMATORS.map(([name, description, robot], index) =>
-    h(
-      "div",
-      { class: "field check estimator" },
-      h("input", { type: "radio", name: "estimator", id: `estimator-${index}`, value: name, checked: index === 0, onchange: () => onchange(name, robot) }),
-      h("label", { for: `estimator-${index}` }, h("strong", {}, name), name === "rigid-body" ? startRobot : null, index ? "" : " (default)", h("span", { class: "hint" }, ` ${description}`)),
-    ),
-  );
-  const element = h(
-    "fieldset",
-    {},
-    h("legend", {}, "Estimator"),
-    h("p", { class: "hint" }, "The physics that the model assumes. All estimators also learn friction."),
-    made.slice(0, VISIBLE_COUNT),
-    h("details", {}, h("summary", {}, "More estimators"), made.slice(VISIBLE_COUNT)),
-  );
-  return {
-    element,
-    robot(name) {
-      startRobot.textContent = name ? ` with ${name}` : "";
-    },
-  };
+/** Return whether an estimator can start from a robot's URDF. */
+export function usesRobot(name) {
+  return ESTIMATORS.find(([each]) => each === name)[2];
+}
+
+/** Radio buttons of the estimators. */
+export function Estimators({ chosen, onchoose }) {
+  const choice = ([name, description], index) => html`<div class="field check estimator" key=${name}>
+    <input type="radio" name="estimator" id=${`estimator-${index}`} value=${name} checked=${name === chosen} onChange=${() => onchoose(name)} />
+    <label for=${`estimator-${index}`}><strong>${name}</strong>${index === 0 && " (default)"} <span class="hint">${description}</span></label>
+  </div>`;
+  return html`<fieldset>
+    <legend>Estimator</legend>
+    <p class="hint">The physics that the model assumes. All estimators also learn friction.</p>
+    ${ESTIMATORS.map(choice)}
+  </fieldset>`;
 }

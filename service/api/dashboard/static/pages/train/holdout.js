@@ -1,7 +1,7 @@
 // Choice of the part that is held out of the training to evaluate the version.
 
-import { h } from "../../dom.js";
-import { field } from "../../ui.js";
+import { Choice, Field } from "../../components.js";
+import { html } from "../../preact.js";
 
 const KINDS = [
   ["auto", "automatic"],
@@ -19,57 +19,36 @@ const EXPLANATIONS = {
   "": "The quality of the version remains unknown. Choose this only if you evaluate it on another recording.",
 };
 
-/**
- * Create this part of the form. named: rows selected on the page of a data set, {data set: [[first, last]]}, or null.
- * Returns {element, value()}; value(): the holdout of a job request, null for nothing.
- */
-export function holdoutChoice(named = null) {
+/** The choice before any change; numbers are texts, as typed. */
+export const NO_CHANGES = { kind: "auto", share: "30", blocks: "10", seed: "0", guard_s: "", only: false };
+
+/** The fields. named: rows selected on the page of a data set, {data set: [[first, last]]}, or null. */
+export function Holdout({ value, onchange, named }) {
+  const set = (name, changed) => onchange({ ...value, [name]: changed });
   const kinds = named ? [["stretches", "the range selected in the plots"], ...KINDS] : KINDS;
-  const kind = h("select", { name: "holdout.kind" }, kinds.map(([value, label]) => h("option", { value }, label)));
-  const share = number("holdout.share", 30, { min: 1, max: 90, step: "any", required: true });
-  const blocks = number("holdout.blocks", 10, { min: 2, max: 1000, step: 1 });
-  const seed = number("holdout.seed", 0, { min: 0, max: 2147483647, step: 1 });
-  const guard = h("input", { type: "number", name: "holdout.guard_s", min: "0", max: "3600", step: "any", placeholder: "one period of the low-pass filter" });
-  const only = h("input", { type: "checkbox", name: "holdout.only" });
-  const about = h("p", { class: "hint" });
-  const fields = {
-    share: field("Share, %", share),
-    blocks: field("Blocks", blocks),
-    seed: field("Seed", seed),
-    guard: field("Guard, s", guard, "Samples this close to the boundary are used neither for training nor for evaluation."),
-    only: field("Never train on this part", only),
-  };
-  const show = () => {
-    about.textContent = EXPLANATIONS[kind.value];
-    fields.guard.hidden = fields.only.hidden = kind.value === "";
-    fields.share.hidden = kind.value === "" || kind.value === "stretches";
-    fields.blocks.hidden = kind.value !== "blocks";
-    fields.seed.hidden = kind.value !== "blocks" && kind.value !== "episodes";
-    share.disabled = kind.value === ""; // a hidden invalid value must not block the form
-  };
-  kind.addEventListener("change", show);
-  show();
-  return {
-    element: h(
-      "fieldset",
-      {},
-      h("legend", {}, "Hold out"),
-      h("p", { class: "hint" }, "The model is first trained without this part and evaluated on it. Then it is trained on all rows."),
-      h("div", { class: "grid" }, field("Which part", kind), fields.share, fields.blocks, fields.seed, fields.guard),
-      fields.only,
-      about,
-    ),
-    value: () => {
-      if (!kind.value) return null;
-      const chosen = { kind: kind.value, ...(kind.value === "stretches" ? { stretches: named } : { share: share.valueAsNumber / 100 }) };
-      if (only.checked) chosen.only = true;
-      if (kind.value === "blocks") chosen.blocks = blocks.valueAsNumber;
-      if (kind.value !== "last" && kind.value !== "stretches") chosen.seed = seed.valueAsNumber;
-      return guard.value ? { ...chosen, guard_s: guard.valueAsNumber } : chosen;
-    },
-  };
+  const number = (label, name, limits, hint) => html`<${Field} label=${label} hint=${hint} input=${(attributes) => html`<input ...${attributes}
+    type="number" name=${`holdout.${name}`} value=${value[name]} onInput=${(event) => set(name, event.target.value)} ...${limits} />`} />`;
+  const { kind } = value;
+  return html`<fieldset>
+    <legend>Hold out</legend>
+    <p class="hint">The model is first trained without this part and evaluated on it. Then it is trained on all rows.</p>
+    <${Choice} label="Which part" options=${kinds} value=${kind} onchange=${(changed) => set("kind", changed)} hint=${EXPLANATIONS[kind]} />
+    ${kind && html`<div class="grid thirds">
+      ${kind !== "stretches" && number("Share, %", "share", { min: 1, max: 90, step: "any", required: true })}
+      ${kind === "blocks" && number("Blocks", "blocks", { min: 2, max: 1000, step: 1, required: true })}
+      ${(kind === "blocks" || kind === "episodes") && number("Seed", "seed", { min: 0, max: 2147483647, step: 1, required: true })}
+      ${number("Guard, s", "guard_s", { min: 0, max: 3600, step: "any", placeholder: "one filter period" }, "Samples this close to the boundary are in neither part.")}
+    </div>
+    <${Field} kind="check" label="Never train on this part" input=${(attributes) => html`<input ...${attributes} type="checkbox" name="holdout.only" checked=${value.only} onChange=${(event) => set("only", event.target.checked)} />`} />`}
+  </fieldset>`;
 }
 
-function number(name, value, limits) {
-  return h("input", { type: "number", name, value: String(value), required: true, ...limits });
+/** Return the holdout of a job request; null for nothing. */
+export function holdoutOf({ kind, share, blocks, seed, guard_s: guard, only }, named) {
+  if (!kind) return null;
+  const chosen = { kind, ...(kind === "stretches" ? { stretches: named } : { share: Number(share) / 100 }) };
+  if (only) chosen.only = true;
+  if (kind === "blocks") chosen.blocks = Number(blocks);
+  if (kind !== "last" && kind !== "stretches") chosen.seed = Number(seed);
+  return guard ? { ...chosen, guard_s: Number(guard) } : chosen;
 }
