@@ -79,7 +79,6 @@ def trained(visitor: Visitor) -> None:
     page.get_by_role("button", name="Start training").click()
 
     expect(page.get_by_role("heading", level=1, name="Training my-arm")).to_be_visible()
-    drawn(page.get_by_role("region", name="Objective"))
     version = page.get_by_role("link", name="View version 1")
     expect(version).to_be_visible(timeout=LONG_MS)
     expect(page.get_by_text("held-out samples")).to_be_visible()

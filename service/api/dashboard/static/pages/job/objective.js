@@ -1,97 +1,71 @@
-// Plot of the objective of a fit over its iterations, from the updates that this page received.
+// Plots of the objective of one estimator: one for each search, with an axis of its own.
 
+import { ErrorBox } from "../../components.js";
+import { Export } from "../../exporting.js";
 import { line, plot } from "../../plots.js";
+import { html, useEffect, useRef, useState } from "../../preact.js";
 
-/** Points by job, kept while the dashboard is open, so that the curve continues after a return to the job. */
-const seen = new Map();
-const MAX_JOBS = 20;
+const NAMES = { geometry: "Geometry", hyperparameters: "Fit" };
+const TICKS = 6;
 
-/** Plot of a job's objective. Each attempt of a restarted job has its own curve. */
-export class Objective {
-  #place;
-  #signal;
-  #drawn = null;
-  #drawing = false;
-  #next = null;
+/** What the plots mean, true for each of them. */
+export const OBJECTIVE_HINT = "Objective: penalised negative log evidence of the training samples. Within one plot, lower is a better fit. Plots are not comparable: their samples or models differ.";
 
-  constructor(place, signal) {
-    this.#place = place;
-    this.#signal = signal;
-  }
+/** The plots of an estimator. row: of `observe`; job: named in files. */
+export function Objective({ estimator, row, job }) {
+  const curves = [...row.curves];
+  const table = () => [["estimator", "search", "iteration", "objective, nats"], ...curves.flatMap(([stage, { x, y }]) => x.map((each, index) => [estimator, NAMES[stage].toLowerCase(), each, y[index]]))];
+  return curves.length > 0 && html`<div>
+    <div class="grid objectives">${curves.map(([stage, curve]) => html`<${Curve} key=${stage} name=${`${NAMES[stage]} of ${estimator}`} curve=${curve} length=${curve.x.length} />`)}</div>
+    <${Export} name=${`objective of ${estimator}, ${job.model}`} table=${table} />
+  </div>`;
+}
 
-  /** Return the number of iterations in the plot. */
-  static points(id) {
-    return [...(seen.get(id)?.values() ?? [])].reduce((sum, { x }) => sum + x.length, 0);
-  }
+/** Draw a curve that grows. The plot is kept: if points arrive faster than it can be drawn, only the last state is drawn. */
+function Curve({ name, curve, length }) {
+  const place = useRef(null), work = useRef({ plot: null, drawing: false, next: null, stop: null }), [error, setError] = useState(null);
+  useEffect(() => {
+    work.current.stop = new AbortController();
+    return () => work.current.stop.abort();
+  }, []);
+  useEffect(() => {
+    draw(place.current, work.current, name, curve).then(() => setError(null), (failure) => work.current.stop.signal.aborted || setError(failure));
+  }, [name, curve, length]);
+  return html`<div>${error && html`<${ErrorBox} error=${error} />`}<div class="objective" ref=${place}></div></div>`;
+}
 
-  /** Return the first iteration in the plot; null if there is none. */
-  static first(id) {
-    const [curve] = seen.get(id)?.values() ?? [];
-    return curve?.x[0] ?? null;
-  }
-
-  /** Add the progress of a job; return whether it has a new point. */
-  add(job) {
-    const { objective, iteration, estimator } = job.progress;
-    if (objective === null || objective === undefined || !iteration) return false;
-    const curves = curvesOf(job.id);
-    const key = JSON.stringify([job.attempts, estimator ?? null]);
-    if (!curves.has(key)) curves.set(key, { attempt: job.attempts, estimator: estimator ?? null, x: [], y: [] });
-    const curve = curves.get(key);
-    if (curve.x.at(-1) >= iteration) return false;
-    curve.x.push(iteration);
-    curve.y.push(objective);
-    return true;
-  }
-
-  /** Draw the plot. If updates arrive faster than they can be drawn, only the last one is drawn. */
-  async draw(job) {
-    this.#next = job;
-    if (this.#drawing) return;
-    this.#drawing = true;
-    try {
-      while (this.#next) {
-        const now = this.#next;
-        this.#next = null;
-        await this.#draw(now);
-      }
-    } finally {
-      this.#drawing = false;
+async function draw(place, work, name, curve) {
+  work.next = curve;
+  if (work.drawing) return;
+  work.drawing = true;
+  try {
+    while (work.next && !work.stop.signal.aborted) {
+      const { x, y } = work.next;
+      work.next = null;
+      const label = `${name}: objective ${y.at(-1).toFixed(1)} nats at iteration ${x.at(-1)}, ${y[0].toFixed(1)} at iteration ${x[0]}`;
+      const traces = [line([...x], [...y], name, "accent", { mode: "lines+markers", marker: { size: 5 }, hovertemplate: "%{y:.1f} nats<extra></extra>" })];
+      const layout = {
+        title: name,
+        x: "iteration",
+        y: "objective, nats",
+        height: 230,
+        showlegend: false,
+        xaxis: { dtick: wholeStep(x.at(-1) - x[0]), tickformat: "d" },
+        yaxis: { nticks: 5, exponentformat: "none" },
+      };
+      if (work.plot) {
+        place.setAttribute("aria-label", label);
+        await work.plot.react(traces, layout);
+      } else work.plot = await plot(place, traces, layout, { label, signal: work.stop.signal });
     }
-  }
-
-  async #draw(job) {
-    const all = [...curvesOf(job.id).values()];
-    if (this.#signal.aborted || !all.length) return;
-    // objectives of different estimators are not comparable: show the current estimator, or the last one
-    const { estimator } = all.find((each) => each.estimator === job.progress.estimator) ?? all.at(-1);
-    const curves = all.filter((each) => each.estimator === estimator);
-    const name = estimator ? `objective of ${estimator}` : "objective";
-    const markers = { mode: "lines+markers", marker: { size: 5 }, hovertemplate: "%{y:.1f} nats" };
-    const traces = curves.map(({ attempt, x, y }, index) => line([...x], [...y], curves.length > 1 ? `attempt ${attempt}` : name, index, markers));
-    const layout = {
-      x: "iteration",
-      y: `${name}, nats`,
-      height: 300,
-      showlegend: curves.length > 1,
-      xaxis: { rangemode: "tozero", tickformat: "d", nticks: 12 },
-      yaxis: { tickformat: ".1f" },
-    };
-    const last = curves.at(-1);
-    const label = `${name.replace("o", "O")} against iteration: ${last.y.at(-1).toFixed(1)} nats at iteration ${last.x.at(-1)}, ${last.y[0].toFixed(1)} at iteration ${last.x[0]}`;
-    if (this.#drawn) {
-      this.#place.setAttribute("aria-label", label);
-      await this.#drawn.react(traces, layout);
-    } else {
-      this.#drawn = await plot(this.#place, traces, layout, { label, signal: this.#signal });
-    }
+  } finally {
+    work.drawing = false;
   }
 }
 
-function curvesOf(id) {
-  if (!seen.has(id)) {
-    if (seen.size >= MAX_JOBS) seen.delete(seen.keys().next().value);
-    seen.set(id, new Map());
-  }
-  return seen.get(id);
+/** Return a step between ticks of whole numbers: 1, 2, 5, 10, … so that no label repeats. */
+export function wholeStep(range) {
+  const least = Math.max(range / TICKS, 1);
+  const power = 10 ** Math.floor(Math.log10(least));
+  return [1, 2, 5, 10].map((each) => each * power).find((each) => each >= least);
 }

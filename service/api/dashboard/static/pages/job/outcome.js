@@ -1,16 +1,15 @@
-// Result of a job: quality of the version, or the cause of the failure.
+// Result of a job: verdict on the version and its errors by joint, or the cause of the failure.
 
 import { get, path } from "../../api.js";
-import { qualityCharts } from "../../charts.js";
-import { h, replace } from "../../dom.js";
-import { count, nmse, number, percent, shortNames } from "../../format.js";
-import { card, link, table } from "../../ui.js";
-import { warningBanner } from "../data/prose.js";
-import { coverageInterval } from "../model/coverage.js";
-import { learningCurveCard } from "../model/learning_curve.js";
-import { promotionNote } from "../model/promotion.js";
-import { selectionCard } from "../model/selection.js";
-import { verdictNote } from "../verdict.js";
+import { jointVar } from "../../colours.js";
+import { Await, Card, Table, useRead } from "../../components.js";
+import { count, nmse, number, percent, shortNames, torqueUnit } from "../../format.js";
+import { html } from "../../preact.js";
+import { JointBadge, VerdictNote } from "../../verdicts.js";
+import { Warnings } from "../data/findings.js";
+import { LearningCurve } from "./learning.js";
+import { Objective, OBJECTIVE_HINT } from "./objective.js";
+import { Selection } from "./selection.js";
 import { HELD_OUT_NOTE } from "./words.js";
 
 const ADVICE = {
@@ -22,63 +21,72 @@ const ADVICE = {
   interrupted: "The service was stopped too often during the job. Retry.",
 };
 
-/** Show the result in an element. */
-export async function outcome(element, job, signal) {
-  if (job.state === "succeeded") return replace(element, await versionResult(job, signal));
-  if (job.state !== "failed") return replace(element);
-  const advice = ADVICE[job.error?.code] ?? "See the service's log for details, and check the reports of the data sets.";
-  return replace(
-    element,
-    h("div", { class: "error", role: "alert" }, h("p", {}, h("strong", {}, "Training failed. "), job.error?.message ?? ""), h("p", {}, advice)),
-  );
+/** Why a job failed, and what to do. */
+export function Failure({ error }) {
+  const advice = ADVICE[error?.code] ?? "See the service's log for details, and check the reports of the data sets.";
+  return html`<div class="error" role="alert"><p><strong>Training failed.</strong> ${error?.message}</p><p>${advice}</p></div>`;
 }
 
-async function versionResult(job, signal) {
-  const more = link(`Version ${job.version} of ${job.model}`, `#/models/${job.model}?version=${job.version}`);
-  let version;
-  try {
-    version = await get(path`/v1/models/${job.model}/versions/${String(job.version)}`, {}, signal);
-  } catch (error) {
-    return card("Result", h("p", {}, more, `: ${error.message}`));
-  }
-  const held = version.lineage.holdout;
-  const trained = version.lineage.training_metrics;
-  const made = card(
-    "Result",
-    h("p", {}, more, servingNote(job, version)),
-    verdictNote(version.verdict),
-    promotionNote(version),
-    warningBanner([...version.warnings, ...(held?.warnings ?? [])]),
-    held?.nmse
-      ? [figures(`On ${count(held.samples)} held-out samples`, held, version), held.learnt ? h("p", { class: "hint" }, HELD_OUT_NOTE) : null]
-      : null,
-    !held?.nmse && trained?.nmse ? figures(`On ${count(trained.samples)} training samples: these figures are optimistic`, trained, version) : null,
-  );
-  return [made, selectionCard(version), learningCurveCard(version)];
+/** The version that a job made. course: of `observe`. */
+export function Result({ job, course }) {
+  const version = useRead((signal) => get(path`/v1/models/${job.model}/versions/${String(job.version)}`, {}, signal), [job.model, job.version]);
+  return html`<${Await} reading=${version} what="Loading the result">${(found) => html`
+    <${Card} title="Result">
+      <${VerdictNote} verdict=${found.verdict} />
+      <p class="muted">${servingNote(job, found)}</p>
+      <${Figures} version=${found} />
+      <${Warnings} texts=${[...found.warnings, ...(found.lineage.holdout?.warnings ?? [])]} />
+    <//>
+    <${LearningCurve} version=${found} />
+    <${Selection} version=${found} />
+    <${Chosen} job=${job} course=${course} estimator=${found.selection?.chosen ?? found.estimator} />`}<//>`;
 }
 
-function servingNote(job, { promotion }) {
-  if (job.refresh) return ". It starts serving once it predicts better than the current version.";
-  return promotion?.answers === false ? ". It is a candidate and does not serve." : ". It serves unless another version was chosen.";
+function servingNote(job, { version, verdict, promotion }) {
+  if (job.refresh) return "It starts serving once it predicts better than the current version.";
+  if (promotion?.answers === false) return verdict.serves ? `Version ${version} is a candidate and does not serve. ${promotion.reason}` : `Version ${version} is a candidate and does not serve.`;
+  const doubt = promotion && !verdict.serves ? `, although it is ${verdict.label}` : "";
+  return `Version ${version} serves unless another version was chosen${doubt}.`;
 }
 
-function figures(caption, found, version) {
+function Figures({ version }) {
+  const { verdict, lineage } = version;
+  const trained = lineage.training_metrics;
+  if (verdict.joints.length) return html`<${Judged} version=${version} held=${lineage.holdout} />`;
+  return trained?.nmse && html`<${Trained} version=${version} figures=${trained} />`;
+}
+
+function Judged({ version, held }) {
   const names = shortNames(version.joint_names);
-  return [h("div", { class: "charts wide" }, qualityCharts(names, found)), figuresTable(caption, found, names, version.joint_types)];
+  const columns = [
+    jointColumn(names),
+    { label: "RMSE", numeric: true, cell: ({ each }) => `${number(each.rmse)} ${each.unit}` },
+    { label: "Of range", numeric: true, cell: ({ each }) => percent(each.range_share) },
+    { label: "Coverage", numeric: true, cell: ({ each }) => percent(each.coverage, 0) },
+    { label: "Level", cell: ({ each }) => html`<${JointBadge} joint=${each} />` },
+  ];
+  const samples = held?.samples ? `On ${count(held.samples)} held-out samples` : "By joint";
+  return html`<${Table} columns=${columns} rows=${version.verdict.joints.map((each, joint) => ({ each, joint }))} caption=${samples} />
+    <p class="hint">Of range: RMSE as a share of the range of the torque. Coverage: share of the measurements inside the 95\u00a0% interval.${held?.learnt && ` ${HELD_OUT_NOTE}`}</p>`;
 }
 
-function figuresTable(caption, found, names, types) {
-  const unit = types.includes("prismatic") ? "N·m or N" : "N·m";
-  return table(
-    [
-      { label: "Joint", cell: (row) => row.name },
-      { label: "nMSE", numeric: true, cell: (row) => nmse(row.nmse) },
-      { label: "95\u00a0% coverage", numeric: true, cell: (row) => percent(row.coverage) },
-      { label: "95\u00a0% CI of coverage", numeric: true, cell: (row) => row.interval },
-      { label: `RMSE, ${unit}`, numeric: true, cell: (row) => number(row.rmse) },
-      { label: `95\u00a0% interval width, ${unit}`, numeric: true, cell: (row) => (row.width === undefined ? "–" : number(row.width)) },
-    ],
-    names.map((name, index) => ({ name, nmse: found.nmse[index], rmse: found.rmse[index], coverage: found.coverage[index], interval: coverageInterval(found, index), width: found.interval_width?.[index] })),
-    { caption },
-  );
+function Trained({ version, figures }) {
+  const names = shortNames(version.joint_names);
+  const columns = [
+    jointColumn(names),
+    { label: "RMSE", numeric: true, cell: ({ joint }) => `${number(figures.rmse[joint])} ${torqueUnit(version.joint_types[joint])}` },
+    { label: "nMSE", numeric: true, cell: ({ joint }) => nmse(figures.nmse[joint]) },
+    { label: "95\u00a0% coverage", numeric: true, cell: ({ joint }) => percent(figures.coverage[joint], 0) },
+  ];
+  return html`<${Table} columns=${columns} rows=${names.map((_name, joint) => ({ joint }))} caption=${`On ${count(figures.samples)} training samples: these figures are optimistic`} />`;
+}
+
+function jointColumn(names) {
+  return { label: "Joint", cell: ({ joint }) => html`<span class="joint" style=${`--own: ${jointVar(joint)}`}>${names[joint]}</span>` };
+}
+
+/** The objective of the estimator that was chosen, if the page was open during its search. */
+function Chosen({ job, course, estimator }) {
+  const row = course.rows.get(estimator);
+  return row?.curves.size > 0 && html`<${Card} title="Objective"><p class="hint">${OBJECTIVE_HINT}</p><${Objective} estimator=${estimator} row=${row} job=${job} /><//>`;
 }
