@@ -1,6 +1,7 @@
 """Data sets and jobs in the browser: rejected upload, episodes, deletion, cancelled and retried job."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def test_rejected_recording_is_imported_with_the_proposed_option(visitor: Visito
     for joint in (1, 2):
         table[f"q{joint}"] = [f"{np.rad2deg(float(value)) + 180:.12g}" for value in table[f"q{joint}"]]
     page = visitor.open("#/data")
-    page.locator("input[type=file]").first.set_input_files([file("degrees.csv", csv(table))])
+    page.get_by_label("Recordings to upload").set_input_files([file("degrees.csv", csv(table))])
     page.get_by_label("Name", exact=True).fill("in degrees")
     page.get_by_role("button", name="Upload", exact=True).click()
 
@@ -80,8 +81,8 @@ def test_import_options_set_how_a_file_is_read(visitor: Visitor) -> None:
     page.get_by_label("Meaning of the torque column").select_option("current")
     constants.fill("2, 4")
     page.get_by_label("Joint names").fill("shoulder, elbow")
-    page.locator("input[type=file]").first.set_input_files([file("current.npz", body)])
-    expect(page.get_by_text("Import options: effort")).to_contain_text("torque constants: 2, 4")
+    page.get_by_label("Recordings to upload").set_input_files([file("current.npz", body)])
+    expect(page.get_by_text("Import options: Meaning")).to_contain_text("Torque constants: 2, 4")
     assert audit(page) == []
     page.get_by_role("button", name="Upload", exact=True).click()
     page.get_by_role("link", name="View report").click()
@@ -90,6 +91,35 @@ def test_import_options_set_how_a_file_is_read(visitor: Visitor) -> None:
     expect(page.get_by_text("torque is motor current times the torque constants 2, 4 N·m/A")).to_be_visible()
     page.get_by_text("samples of 2 joints").click()
     expect(page.get_by_text("Joints: shoulder, elbow")).to_be_visible()
+
+
+def test_files_are_dropped_below_the_options_that_they_obey(visitor: Visitor) -> None:
+    page = visitor.open("#/data")
+    card = page.get_by_role("region", name="Upload a recording")
+    options = card.get_by_text("Import options: robot").bounding_box()
+    zone = card.get_by_text("Drop recordings anywhere").bounding_box()
+    assert options is not None
+    assert zone is not None
+    assert options["y"] + options["height"] <= zone["y"]
+
+
+def test_list_shows_the_worst_finding_of_a_recording(visitor: Visitor, dashboard: Dashboard) -> None:
+    samples = stream("panda", samples=300, seed=15)
+    upload(dashboard.client, replace(samples, tau=-samples.tau), name="reversed", robot="panda")
+    report = dashboard.client.get("/v1/datasets/reversed").json()["report"]
+    assert report["remedies"][0]["cause"] == "torque_sign"
+    page = visitor.open("#/data")
+    row = page.get_by_role("table", name="Recordings").get_by_role("row").filter(has_text="reversed")
+    expect(row).to_contain_text(report["remedies"][0]["text"].partition(". ")[0])
+    expect(row).to_contain_text(re.compile("[1-9] more"))
+    expect(row.get_by_text("warning")).to_be_visible()
+    row.get_by_role("link", name="Read reversed again").click()
+    expect(page.get_by_role("tab", name="Read again", selected=True)).to_be_visible()
+    page.get_by_role("button", name="Read again with").first.click()
+    expect(page).not_to_have_url(re.compile("tab=again"))
+    expect(page.get_by_role("heading", level=1, name="reversed")).to_be_visible()
+    again = dashboard.client.get("/v1/datasets/reversed").json()["report"]
+    assert "torque_sign" not in {each["cause"] for each in again["remedies"]}
 
 
 def test_lines_have_gaps_between_episodes(visitor: Visitor, dashboard: Dashboard) -> None:
@@ -101,7 +131,7 @@ def test_lines_have_gaps_between_episodes(visitor: Visitor, dashboard: Dashboard
     )
     assert answer.status_code == 201, answer.text
     page = visitor.open(f"#/data/{answer.json()['id']}")
-    expect(page.locator(".js-plotly-plot .scatterlayer")).to_have_count(4)
+    expect(page.locator(".strip .linked")).to_have_count(4)
     # the time of each episode starts again, so episodes would overlap
     expect(page.get_by_label("Horizontal axis", exact=True)).to_have_value("rows")
     breaks = "[...document.querySelectorAll('.js-plotly-plot')].map((each) => each.data.map(({y}) => y.indexOf(null)))"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.service.data import stream, upload
 from tests.system.browser.accessibility import audit, expect
@@ -21,6 +23,10 @@ if TYPE_CHECKING:
 SAMPLES = stream(samples=200, rate=20.0, seed=31)
 RANGES = "[...document.querySelectorAll('.strip')].map(({layout}) => layout.xaxis.range)"
 CURSORS = "[...document.querySelectorAll('.strip .cursor')].map((each) => each.hidden ? null : each.style.left)"
+SCALES = """[...document.querySelectorAll('.strip')].map(({data, layout}) => data.map(({y, yaxis}) =>
+  [layout[(yaxis ?? "y").replace("y", "yaxis")].range, Math.min(...y), Math.max(...y)]))"""
+"""Range of each y axis, and the smallest and largest value in it."""
+NAMES = {"q": "Position", "dq": "Velocity", "ddq": "Acceleration", "tau": "Torque"}
 AREA = """(plot) => {
   const {x, y, width, height} = plot.querySelector(".nsewdrag").getBoundingClientRect();
   return [x, y, width, height];
@@ -36,6 +42,17 @@ def dataset(dashboard: Dashboard) -> str:
 def drawn(page: Page) -> None:
     """Wait until all plots and their overlays are drawn."""
     expect(page.locator(".strip .linked")).to_have_count(4)
+
+
+def at_cursor(page: Page, name: str) -> list[str]:
+    """Return joints and their values at the cursor."""
+    return page.get_by_role("list", name=f"{name} at the cursor").get_by_role("listitem").all_inner_texts()
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return width and height of a PNG, px."""
+    with Image.open(path) as opened:
+        return opened.size
 
 
 def across(page: Page, plot: int, share: float) -> tuple[float, float]:
@@ -69,20 +86,20 @@ def test_recommendations_come_first_and_tab_is_in_the_address(visitor: Visitor, 
     page.get_by_role("tab", name="Signals").focus()
     steps = (
         ("ArrowRight", "Timing"),
-        ("End", "Preparation"),
+        ("End", "Read again"),
         ("ArrowRight", "Signals"),
-        ("ArrowLeft", "Preparation"),
+        ("ArrowLeft", "Read again"),
     )
     for key, name in steps:
         page.keyboard.press(key)
         expect(page.get_by_role("tab", name=name, exact=True)).to_be_focused()
         expect(page.get_by_role("tab", selected=True)).to_have_text(name)
         expect(page.get_by_role("tabpanel", name=name)).to_be_visible()
-    expect(page).to_have_url(re.compile(r"\?tab=preparation$"))
+    expect(page).to_have_url(re.compile(r"\?tab=again$"))
     page.reload()
     visitor.settled()
-    expect(page.get_by_role("tab", selected=True)).to_have_text("Preparation")
-    for name in ("Timing", "Excitation", "Friction"):
+    expect(page.get_by_role("tab", selected=True)).to_have_text("Read again")
+    for name in ("Timing", "Excitation", "Friction", "Preparation"):
         page.get_by_role("tab", name=name).click()
         expect(page.get_by_role("tabpanel", name=name).get_by_role("region").first).to_be_visible()
         assert audit(page) == []
@@ -98,21 +115,75 @@ def test_all_plots_share_one_cursor(visitor: Visitor, dataset: str) -> None:
     assert 24 < float(places[0].rstrip("%")) < 26
     low, high = page.evaluate(RANGES)[0]
     row = int(np.abs(SAMPLES.t - (low + 0.25 * (high - low))).argmin())
-    table = page.get_by_role("table", name="Values at the cursor")
-    for joint, name in enumerate(SAMPLES.joint_names):
-        shown = table.get_by_role("row", name=name).get_by_role("cell").all_text_contents()
-        known = [getattr(SAMPLES, each)[row, joint] for each in ("q", "dq", "ddq", "tau")]
-        steps = [np.abs(np.diff(getattr(SAMPLES, each)[:, joint])).max() for each in ("q", "dq", "ddq", "tau")]
-        for text, value, step in zip(shown, known, steps, strict=True):
-            assert float(text) == pytest.approx(value, abs=step + 0.01 * abs(value))
+    for quantity, name in NAMES.items():
+        for joint, text in enumerate(at_cursor(page, name)):
+            samples = getattr(SAMPLES, quantity)[:, joint]
+            step = np.abs(np.diff(samples)).max()
+            assert float(text.split()[-1]) == pytest.approx(samples[row], abs=step + 0.01 * abs(samples[row]))
     slider = page.get_by_role("slider", name="Cursor")
     slider.focus()
     slider.press("End")
     expect(slider).to_have_attribute("aria-valuetext", re.compile("At 9.95 s"))
-    expect(table.get_by_role("row", name=SAMPLES.joint_names[0]).get_by_role("cell").first).to_have_text(
-        re.compile(re.escape(f"{SAMPLES.q[-1, 0]:.2f}"))
+    expect(page.get_by_role("list", name="Position at the cursor").get_by_role("listitem").first).to_contain_text(
+        f"{SAMPLES.q[-1, 0]:.2f}"
     )
     assert audit(page) == []
+
+
+def test_each_joint_has_its_own_scale_and_unit(visitor: Visitor, dashboard: Dashboard) -> None:
+    given = stream("panda", samples=120, rate=20.0, seed=34)
+    tau = given.tau * np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1e-3])  # invisible on the scale of the others
+    small = upload(dashboard.client, replace(given, tau=tau), name="small wrist", robot="panda")["id"]
+    page = visitor.open(f"#/data/{small}")
+    drawn(page)
+    scales = page.evaluate(SCALES)
+    assert [len(each) for each in scales] == [7] * 4
+    for (low, high), least, most in (plot for column in scales for plot in column):
+        assert low <= least <= most <= high
+        assert most - least > 0.8 * (high - low)
+    for name, unit in zip(NAMES.values(), ("rad", "rad/s", "rad/s²", "N·m"), strict=True):
+        assert all(each.endswith(f"\u00a0{unit}") for each in at_cursor(page, name)), name
+    assert visitor.overflow() <= 0
+    assert audit(page) == []
+
+
+def test_signals_are_saved_as_png_and_csv(visitor: Visitor, dataset: str) -> None:
+    page = visitor.open(f"#/data/{dataset}")
+    drawn(page)
+    page.get_by_role("button", name="as PNG").focus()
+    with page.expect_download() as picture:
+        page.keyboard.press("Enter")
+    assert picture.value.suggested_filename == "signals-of-ten-seconds.png"
+    width, height = image_size(picture.value.path())
+    strips = page.locator(".quantities").bounding_box()
+    assert strips is not None
+    assert width == pytest.approx(2 * strips["width"], abs=4)  # all plots, as on the page
+    assert height > 2 * 150
+    page.get_by_role("button", name="as CSV").focus()
+    with page.expect_download() as numbers:
+        page.keyboard.press("Enter")
+    head, *rows = numbers.value.path().read_text().splitlines()
+    assert head == 'joint,quantity,unit,sample,"time, s",value'
+    assert len(rows) == 4 * SAMPLES.tau.size
+    first = rows[0].split(",")
+    assert first[:2] == [SAMPLES.joint_names[0], "q"]
+    assert float(first[-1]) == pytest.approx(SAMPLES.q[0, 0], rel=1e-6)
+
+
+def test_findings_name_fields_instead_of_flags(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
+    told = dashboard.client.get(f"/v1/datasets/{dataset}").json()
+    said = ["Name the robot with `--robot` to check limits.", "Read the file again with `robot=ur10 effort=measured`."]
+    told["report"] |= {"warnings": said[:1], "advice": said[1:]}
+    visitor.page.route(f"**/v1/datasets/{dataset}", lambda route: route.fulfill(json=told))
+    page = visitor.open(f"#/data/{dataset}")
+    expect(page.get_by_role("region", name="Warnings")).to_contain_text("Name the robot with Robot to check limits.")
+    expect(page.get_by_role("region", name="Recommendations")).to_contain_text(
+        "Read the file again with Robot: ur10, Meaning of the torque column: measured."
+    )
+    expect(page.get_by_text("--robot")).to_have_count(0)
+    page.get_by_role("tab", name="Read again").click()
+    expect(page.get_by_label("Robot", exact=True)).to_be_visible()  # the field has this name
+    expect(page.get_by_label("Meaning of the torque column")).to_be_visible()
 
 
 def test_all_plots_share_one_zoom(visitor: Visitor, dataset: str) -> None:
@@ -178,8 +249,8 @@ def test_file_is_read_again_with_other_options(visitor: Visitor, dashboard: Dash
     first = upload(dashboard.client, SAMPLES, name="again", torque_factors="1,-1")["id"]
     visitor.expect_refusals(422)
     page = visitor.open(f"#/data/{first}")
+    page.get_by_role("tab", name="Read again").click()
     again = page.get_by_role("region", name="Read again")
-    again.get_by_text("Import options").click()
     factors = again.get_by_label("Torque factors")
     expect(factors).to_have_value("1,-1")
     factors.fill("1")

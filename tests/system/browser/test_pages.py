@@ -22,7 +22,7 @@ from tests.system.browser.visitor import DESKTOP, PHONE, Visitor, compress
 NARROWEST = (320, 640)
 """A window 1280 px wide at 400 %: WCAG 2.2, 1.4.10."""
 MODEL_TABS = ("accuracy", "parts", "arm", "versions", "lineage", "ask", "learning")
-DATA_TABS = ("signals", "timing", "excitation", "friction", "preparation")
+DATA_TABS = ("signals", "timing", "excitation", "friction", "preparation", "again")
 MODEL = "cell-3"
 RATE, TAKEN = 20.0, 8.0
 """Rate of the stream, Hz, and time at which the robot picks up 1.5 kg, s."""

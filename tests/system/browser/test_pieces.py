@@ -23,6 +23,6 @@ def test_missing_extras_are_explained_beside_their_controls(windows: Visit, tmp_
         expect(page.get_by_role("button", name="Choose files")).to_be_enabled()
         assert audit(page) == []
         recording = {"name": "a.csv", "mimeType": "text/csv", "buffer": csv(columns(stream(seed=11)))}
-        page.locator("input[type=file]").first.set_input_files([recording])
+        page.get_by_label("Recordings to upload").set_input_files([recording])
         page.get_by_role("button", name="Upload", exact=True).click()
         expect(page.get_by_role("alert")).to_contain_text(INGEST)

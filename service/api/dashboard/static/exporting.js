@@ -2,7 +2,7 @@
 
 import { css } from "./colours.js";
 import { Button } from "./components.js";
-import { plotly } from "./plots.js";
+import { escapeMarkup, plotly } from "./plots.js";
 import { html, useRef } from "./preact.js";
 
 const SCALE = 2; // pixels of the picture per CSS pixel
@@ -10,12 +10,12 @@ const FONT = "system-ui, sans-serif"; // a picture does not inherit the page's f
 
 /**
  * Buttons that save the plots of an element as PNG and their numbers as CSV.
- * name: of the files; of: the element, or nothing: that around the buttons; table(): [[heading, …], [value, …], …].
+ * name: of the files; of(): the element; without, that around the buttons; table(): [[heading, …], [value, …], …].
  */
 export function Export({ name, of, table }) {
   const self = useRef(null);
   const file = name.replace(/[^\p{L}\p{N}._-]+/gu, "-");
-  const picture = async () => save(await pictureOf(of ?? self.current.parentElement), `${file}.png`);
+  const picture = async () => save(await pictureOf(of?.() ?? self.current.parentElement), `${file}.png`);
   const numbers = async () => save(new Blob([csv(await table())], { type: "text/csv" }), `${file}.csv`);
   return html`<div class="actions export" role="group" aria-label=${`Export ${name}`} ref=${self}>
     <${Button} onclick=${picture} label=${`Save ${name} as PNG`}>PNG<//>
@@ -52,7 +52,7 @@ async function pictureOf(element) {
 /** Return an image of one plot, with the names that the page writes over it: `layout.meta`, [{text, x, y}]. */
 async function drawing({ data, layout }, width, height) {
   const Plotly = await plotly(data.some(({ type }) => type === "scatter3d" || type === "mesh3d") ? "gl3d" : "cartesian");
-  const over = (layout.meta ?? []).map(({ text, x, y }) => ({ text, x, y, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom", showarrow: false }));
+  const over = (layout.meta ?? []).map(({ text, x, y }) => ({ text: escapeMarkup(text), x, y, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom", showarrow: false }));
   const figure = { data, layout: { ...layout, annotations: [...(layout.annotations ?? []), ...over], font: { ...layout.font, family: FONT } } };
   const address = await Plotly.toImage(figure, { format: "png", width, height, scale: SCALE });
   const image = new Image();

@@ -75,11 +75,11 @@ export class LinkedPlots {
   }
 
   #layOut(element, { layer, cursor, stretch, marks }) {
-    const area = element.querySelector(".nsewdrag")?.getBoundingClientRect();
-    if (!area) return;
+    const areas = [...element.querySelectorAll(".nsewdrag")].map((each) => each.getBoundingClientRect()); // one for each y axis
+    if (!areas.length) return;
     const outer = element.getBoundingClientRect();
-    const [left, top] = [area.left - outer.left, area.top - outer.top];
-    layer.style.cssText = `left: ${left}px; top: ${top}px; width: ${area.width}px; height: ${area.height}px`;
+    const [top, bottom] = [Math.min(...areas.map((each) => each.top)), Math.max(...areas.map((each) => each.bottom))];
+    layer.style.cssText = `left: ${areas[0].left - outer.left}px; top: ${top - outer.top}px; width: ${areas[0].width}px; height: ${bottom - top}px`;
     placeBetween(cursor, element, this.#at, this.#at);
     placeBetween(stretch, element, ...(this.#stretch ?? [null, null]));
     this.#drawMarks(element, { marks });

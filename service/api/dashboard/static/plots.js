@@ -109,6 +109,7 @@ function withTheme({ title = "", x = "", y = "", height = 300, ...rest }) {
     plot_bgcolor: "rgba(0,0,0,0)",
     font: { family: "inherit", size: 12.5, color: css("text") },
     hoverlabel: { bgcolor: css("surface"), bordercolor: css("line-strong"), font: { color: css("text") } },
+    ...Object.fromEntries(Object.keys(rest).filter((name) => /^[xy]axis\d+$/.test(name)).map((name) => [name, own(name, "")])),
     xaxis: own("xaxis", x),
     yaxis: own("yaxis", y),
   };

@@ -1,62 +1,36 @@
-// All data sets, and the upload.
+// All data sets with their worst finding, and the upload.
 
-import { get } from "../api.js";
-import { h, refresh, replace } from "../dom.js";
-import { ago, count, counted, number, seconds, when } from "../format.js";
-import { badge, button, card, empty, heading, link, notice, table } from "../ui.js";
-import { robots } from "./data/robots.js";
-import { uploader } from "./data/upload.js";
+import { pages } from "../api.js";
+import { Await, Button, Card, Empty, Heading, Link, Listing, page, useRead } from "../components.js";
+import { ago, count, seconds, when } from "../format.js";
+import { html, useEffect, useState } from "../preact.js";
+import { WorstFinding } from "./data/findings.js";
+import { Uploader } from "./data/upload.js";
+
+const STEP = 100; // data sets that are read at once
+const COLUMNS = [
+  { label: "Name", value: (row) => row.name, cell: (row) => html`<${Link} to=${`#/data/${row.id}`}>${row.name}<//>` },
+  { label: "Worst finding", cell: (row) => html`<${WorstFinding} report=${row.report} />` },
+  { label: "Samples", numeric: true, value: (row) => row.report.rows, first: "descending", cell: (row) => count(row.report.rows) },
+  { label: "Length", numeric: true, value: (row) => row.report.timing.duration_s, first: "descending", cell: (row) => seconds(row.report.timing.duration_s) },
+  { label: "Joints", numeric: true, value: (row) => row.joint_names.length, cell: (row) => row.joint_names.length },
+  { label: "Robot", value: (row) => row.report.robot, cell: (row) => row.report.robot ?? "–" },
+  { label: "Uploaded", value: (row) => row.created_at, first: "descending", cell: (row) => html`<time datetime=${row.created_at} title=${when(row.created_at)}>${ago(row.created_at)}</time>` },
+  { label: "Next", cell: (row) => html`<div class="actions next"><${Link} to=${`#/train?datasets=${row.id}`} label=${`Train on ${row.name}`}>Train<//>${row.report.upload_options && html`<${Link} to=${`#/data/${row.id}?tab=again`} label=${`Read ${row.name} again`}>Read again<//>`}</div>` },
+];
 
 /** The page `#/data`. */
-export async function render(view, params, { signal, title }) {
-  title("Data sets");
-  const list = h("div", {});
-  const found = [];
-  let cursor = null;
-  const more = button("Show older", () => load(cursor));
-
-  const load = async (after = null) => {
-    const page = await get("/v1/datasets", { cursor: after }, signal);
-    if (after === null) found.length = 0;
-    found.push(...page.items);
-    cursor = page.next_cursor;
-    refresh(list, found.length ? datasetTable(found) : emptyState(), cursor ? more : null);
-  };
-  const { element, fillRobots } = uploader({ onUploaded: () => load(), signal });
-  await load();
-  replace(view, heading("Data sets", found.length ? link("Train a model", "#/train", "primary") : null), element, card("Recordings", list));
-  // uploads work without the list of robots
-  robots(signal).then(fillRobots, (error) => error.name === "AbortError" || notice(`The robots could not be loaded: ${error.message}`, "bad"));
+function DataSets({ title, signal }) {
+  useEffect(() => title("Data sets"), []);
+  const [most, setMost] = useState(STEP);
+  const reading = useRead((stop) => pages("/v1/datasets", most, {}, stop), [most]);
+  const words = (row) => [row.name, row.report.robot, row.id, ...row.joint_names].join(" ");
+  const simulated = html`No recordings yet. Upload one above, or simulate one: <code>lipserve simulate panda panda.csv</code>`;
+  return html`<${Heading} text="Data sets">${reading.value?.length > 0 && html`<${Link} to="#/train" kind="primary">Train a model<//>`}<//>
+    <${Uploader} onuploaded=${reading.reload} signal=${signal} />
+    <${Card} title="Recordings"><${Await} reading=${reading}>${(found) => (found.length === 0 ? html`<${Empty} text=${simulated} />` : html`
+      <div class="datasets"><${Listing} columns=${COLUMNS} rows=${found} caption="Recordings" what=${["recording", "recordings"]} identity=${(row) => row.id} words=${words} minRows=${4} /></div>
+      ${found.length === most && html`<${Button} onclick=${() => setMost(most + STEP)}>Show older<//>`}`)}<//><//>`;
 }
 
-function datasetTable(datasets) {
-  return table(
-    [
-      { label: "Name", cell: (row) => link(row.name, `#/data/${row.id}`) },
-      { label: "Findings", cell: (row) => findings(row.report) },
-      { label: "Samples", numeric: true, cell: (row) => count(row.report.rows) },
-      { label: "Rate, Hz", numeric: true, cell: (row) => number(row.report.rate_hz, 4) },
-      { label: "Length", numeric: true, cell: (row) => seconds(row.report.timing.duration_s) },
-      { label: "Joints", numeric: true, cell: (row) => row.joint_names.length },
-      { label: "Robot", cell: (row) => row.report.robot ?? "–" },
-      { label: "Uploaded", cell: (row) => h("time", { datetime: row.created_at, title: when(row.created_at) }, ago(row.created_at)) },
-      { label: "Next", cell: (row) => link("Train", `#/train?datasets=${row.id}`) },
-    ],
-    datasets,
-    { caption: "Newest first", key: (row) => row.id },
-  );
-}
-
-function findings(report) {
-  if (report.warnings.length) return badge(counted(report.warnings.length, "warning"), "warn");
-  return report.advice.length ? badge(counted(report.advice.length, "recommendation"), "plain") : badge("no issues", "good");
-}
-
-function emptyState() {
-  return empty(
-    [
-      "No recordings yet. Upload one above, or simulate one: ",
-      h("code", {}, "lipserve simulate panda panda.csv"),
-    ],
-  );
-}
+export const render = page(DataSets);

@@ -1,40 +1,44 @@
 // Reading the file of a data set again with other options.
 
 import { path, post } from "../../api.js";
-import { h, replace } from "../../dom.js";
-import { button, card, notice } from "../../ui.js";
-import { describeOptions, uploadOptions, withOption } from "./options.js";
-import { robots } from "./robots.js";
-import { uploadError } from "./upload_error.js";
+import { Button, Card, useRead } from "../../components.js";
+import { html, useState } from "../../preact.js";
+import { notice } from "../../ui.js";
+import { describeOptions } from "./findings.js";
+import { ImportOptions, queryOf, valueOf, withOption } from "./options.js";
+import { readRobots } from "./robot_choice.js";
+import { UploadError } from "./upload_error.js";
 
-/** Return {corrections, form}: buttons that correct faults, and a card with all options; null if the file was not kept. */
-export async function readingAgain(dataset, signal) {
-  const before = dataset.report.upload_options;
-  if (!before) return { corrections: null, form: null };
-  const options = uploadOptions();
-  options.fillRobots(await robots(signal));
-  options.fill(before);
-  const outcome = h("div", {});
-  const read = async (values) => {
-    replace(outcome, h("p", { role: "status" }, `Reading ${dataset.name}…`));
+/** Read the file of a data set again: {read(query), outcome}; outcome: what to show of the attempt. */
+export function useReading(dataset) {
+  const [outcome, setOutcome] = useState(null);
+  const read = async (query) => {
+    setOutcome(html`<p role="status">Reading ${dataset.name}…</p>`);
     try {
-      const query = new URLSearchParams({ ...values, fresh: "true" });
-      const made = await post(`${path`/v1/datasets/${dataset.id}/read`}?${query}`, undefined, signal);
+      const made = await post(`${path`/v1/datasets/${dataset.id}/read`}?${new URLSearchParams({ ...query, fresh: "true" })}`);
       notice(`${dataset.name} read again.`);
       location.hash = `#/data/${made.id}`;
     } catch (error) {
-      if (error.name === "AbortError") return;
-      const accept = (option, value) => read(withOption(values, option, value));
-      replace(outcome, uploadError(dataset.name, error, accept, () => read(values)));
+      setOutcome(html`<${UploadError} name=${dataset.name} error=${error} accept=${(option, value) => read(withOption(query, option, value))} again=${() => read(query)} />`);
     }
   };
-  const remedies = dataset.report.remedies.filter((each) => each.options);
-  const corrections = remedies.map((each) => button(`Read again with ${describeOptions(each.options)}`, () => read({ ...before, ...each.options })));
-  const form = card(
-    "Read again",
-    h("p", { class: "hint" }, "The uploaded file is read with other options. This data set is deleted unless a job used it."),
-    options.element,
-    h("div", { class: "actions" }, button("Read again", () => read(options.values()))),
-  );
-  return { corrections: h("div", { style: "margin-bottom: 1rem" }, h("div", { class: "actions" }, corrections), outcome), form };
+  return { read, outcome };
+}
+
+/** Buttons that read the file again with the options that correct a fault. */
+export function Corrections({ dataset: { report }, again: { read, outcome } }) {
+  const remedies = report.remedies.filter((each) => each.options);
+  return html`${remedies.length > 0 && html`<div class="actions corrections">${remedies.map((each) => html`<${Button} key=${each.cause} onclick=${() => read({ ...report.upload_options, ...each.options })}>Read again with ${describeOptions(each.options)}<//>`)}</div>`}
+    ${outcome}`;
+}
+
+/** All options, filled with those of the last reading. */
+export function ReadAgain({ dataset, again: { read } }) {
+  const [value, setValue] = useState(() => valueOf(dataset.report.upload_options));
+  const robots = useRead(readRobots, []);
+  return html`<${Card} title="Read again">
+    <p class="hint">The uploaded file is read with other options. This data set is deleted unless a job used it.</p>
+    <${ImportOptions} value=${value} onchange=${setValue} robots=${robots} />
+    <div class="actions"><${Button} kind="primary" onclick=${() => read(queryOf(value))}>Read again<//></div>
+  <//>`;
 }

@@ -1,7 +1,6 @@
 // Findings about a recording, in the words of this dashboard: the worst first, with names of fields instead of command line flags.
 
 import { Badge } from "../../components.js";
-import { counted } from "../../format.js";
 import { html } from "../../preact.js";
 
 /** Labels of import options, by their names in the API. */
@@ -11,6 +10,7 @@ export const LABELS = {
   drop_joints: "Joints to drop", topic: "Topic", column_names: "Column names", dt: "Time from row to row", poses: "Rows", delimiter: "Delimiter",
   filtering: "Low-pass filter", cutoff: "Cutoff frequency", form: "Filter type", rate: "Resampling rate", gap: "Min gap", trim: "Trim at both ends",
 };
+const SHORT = 40; // characters; after a shorter sentence, the next one is shown too
 const FLAGS = { unit: "units", column: "columns", drop: "drop_joints" }; // names on the command line that differ
 
 /** Describe options: Robot: ur5; Units: q deg. */
@@ -47,14 +47,12 @@ export function Warnings({ texts }) {
   return texts.length > 0 && html`<section class="banner" aria-label="Warnings"><strong>Warnings</strong><${Sentences} texts=${texts} /></section>`;
 }
 
-/** The worst finding of a report, with the number of others. */
+/** The worst finding of a report in a sentence or two, with the number of others: a fault, then a warning, then advice. */
 export function WorstFinding({ report }) {
-  const remedies = report.remedies.map((each) => each.text);
-  const faults = [...remedies, ...report.warnings];
-  // the robot is advice too, although options would correct it
-  const fault = report.remedies.some((each) => each.cause !== "robot") || report.warnings.length > 0;
-  const all = [...new Set([...faults, ...report.advice])];
+  const all = [...new Set([...report.remedies.map((each) => each.text), ...report.warnings, ...report.advice])];
   if (!all.length) return html`<${Badge} state="no issues" kind="good" />`;
-  const others = all.length - 1;
-  return html`<div class="finding"><${Badge} state=${fault ? "warning" : "advice"} kind=${fault ? "warn" : "plain"} /> <${Prose} text=${all[0]} />${others > 0 && html` <span class="muted">${counted(others, "more finding", "more findings")}</span>`}</div>`;
+  // a remedy that only names the robot corrects no fault
+  const fault = report.warnings.includes(all[0]) || report.remedies.some((each) => each.text === all[0] && each.cause !== "robot");
+  const [first] = new RegExp(`^.{${SHORT},}?[.!?](?=\\s|$)`, "s").exec(all[0]) ?? [all[0]];
+  return html`<div class="finding"><${Badge} state=${fault ? "warning" : "advice"} kind=${fault ? "warn" : "plain"} /> <${Prose} text=${first} />${all.length > 1 && html` <span class="muted">${all.length - 1} more</span>`}</div>`;
 }

@@ -1,75 +1,45 @@
-// Form with the range of a recording to hold out. It is dragged over the plots or typed, and opens the training form.
+// The range of a recording to hold out. It is dragged over the plots or typed, and opens the training form.
 
-import { h, replace } from "../../dom.js";
+import { Field, Link } from "../../components.js";
 import { count, percent } from "../../format.js";
-import { field, link } from "../../ui.js";
-import { nearest } from "./values.js";
+import { html, useEffect, useState } from "../../preact.js";
+import { nearest } from "./rows.js";
 
-/**
- * Create the form. rows: initial [first, last), or null; chosen(range, rows): called when the range changes, with values
- * of the axis and rows, null for none. Returns {element, take(range), setAxis(axis, rising)}.
- */
-export function holdOut(preview, dataset, rows, axis, { chosen }) {
-  const column = preview.columns[0];
-  const state = { rows };
-  const inputs = ["From", "To"].map((label) => h("input", { type: "number", step: "any", "aria-label": `${label}, held-out range`, onchange: () => typed() }));
-  const units = inputs.map(() => h("span", { class: "muted" })), status = h("p", { role: "status" }), actions = h("div", { class: "actions" });
-  const clear = h("button", { type: "button", onclick: () => set(null) }, "Clear range");
+/** The form. rows: [first, last), or null; axis: "t" or "rows"; rising: whether the axis never decreases; choose(rows). */
+export function HoldOut({ preview, dataset, rows, axis, rising, choose }) {
+  const known = rangeOf(preview, axis, rows);
+  const [typed, setTyped] = useState(null);
+  useEffect(() => setTyped(null), [rows, axis]);
+  const texts = typed ?? (known ? known.map((each) => String(Number(each.toPrecision(6)))) : ["", ""]);
+  const type = (side, text) => setTyped(texts.map((each, index) => (index === side ? text : each)));
+  const take = () => {
+    const [from, to] = texts.map(Number);
+    if (texts.every(Boolean) && from < to) choose(rowsWithin(preview, axis, [from, to]));
+  };
+  const input = (side) => (attributes) => html`<input ...${attributes} type="number" step="any" disabled=${!rising} value=${texts[side]} onInput=${(event) => type(side, event.target.value)} onChange=${take} />`;
+  const unit = axis === "t" ? "s" : "sample";
+  return html`<fieldset class="stretches">
+    <legend>Hold out</legend>
+    <div class="row"><${Field} label=${`From, ${unit}`} input=${input(0)} /><${Field} label=${`To, ${unit}`} input=${input(1)} /></div>
+    <p role="status">${rows ? describe(rows, preview.samples) : "No range selected. Enter it here, or set “Drag action” to “Select the range to hold out” and drag over a plot."}</p>
+    ${rows && html`<div class="actions">
+      <${Link} kind="primary" to=${`#/train?datasets=${dataset.id}&hold_out=${rows.join("-")}`}>Train with this range held out<//>
+      <button type="button" onClick=${() => choose(null)}>Clear range</button>
+    </div>`}
+  </fieldset>`;
+}
 
-  const border = (row) => column[axis()][Math.min(nearest(column.rows, row), column.rows.length - 1)];
-  const range = () => (state.rows === null ? null : [border(state.rows[0]), border(state.rows[1] - 1)]);
-  const set = (found) => {
-    state.rows = found;
-    update();
-    chosen(range(), found);
-  };
-  const take = (dragged) => set(dragged === null ? null : rowsWithin(column, axis(), dragged));
-  const typed = () => {
-    const [from, to] = inputs.map((each) => each.valueAsNumber);
-    if (from < to) take([from, to]);
-  };
-  const update = () => {
-    const found = range();
-    inputs.forEach((input, side) => (input.value = found === null ? "" : String(Number(found[side].toPrecision(6)))));
-    if (state.rows === null) {
-      replace(status, "No range selected. Enter it here, or set “Drag action” to “Select the range to hold out” and drag over a plot.");
-      replace(actions);
-      return;
-    }
-    const [first, last] = state.rows;
-    replace(status, `${count(last - first)} of ${count(preview.samples)} samples (${percent((last - first) / preview.samples, 0)}) are held out of the training and used to evaluate the version.`);
-    replace(actions, link("Train with this range held out", `#/train?datasets=${dataset.id}&hold_out=${first}-${last}`, "primary"), clear);
-  };
-  const element = h(
-    "fieldset",
-    { class: "stretches" },
-    h("legend", {}, "Hold out"),
-    h("div", { class: "row" }, field(["From", units[0]], inputs[0]), field(["To", units[1]], inputs[1])),
-    status,
-    actions,
-  );
-  return {
-    element,
-    take,
-    setAxis(name, rising) {
-      units.forEach((each) => (each.textContent = name === "t" ? ", s" : ", sample"));
-      inputs.forEach((each) => (each.disabled = !rising));
-      update();
-      chosen(rising ? range() : null, state.rows);
-    },
-  };
+/** Return the values of an axis at the first and the last row of a range; null without a range. */
+export function rangeOf({ columns: [column] }, axis, rows) {
+  return rows && [rows[0], rows[1] - 1].map((row) => column[axis][nearest(column.rows, row)]);
 }
 
 /** Return the rows [first, last) in a range of an ascending axis; null if there are fewer than two. */
-function rowsWithin(column, axis, [from, to]) {
-  const along = column[axis];
-  const inside = column.rows.filter((_row, index) => along[index] >= from && along[index] <= to);
+export function rowsWithin({ columns: [column] }, axis, [from, to]) {
+  const inside = column.rows.filter((_row, index) => column[axis][index] >= from && column[axis][index] <= to);
   return inside.length > 1 ? [inside[0], inside.at(-1) + 1] : null;
 }
 
-/** Parse rows [first, last) from text such as 300-450; null if it is invalid. */
-export function rowsOf(text) {
-  const found = /^(\d+)-(\d+)$/.exec(text ?? "");
-  const rows = found && [Number(found[1]), Number(found[2])];
-  return rows && rows[0] < rows[1] ? rows : null;
+function describe([first, last], samples) {
+  return `${count(last - first)} of ${count(samples)} samples (${percent((last - first) / samples, 0)}) are held out of the training and used to evaluate the version.`;
 }

@@ -1,8 +1,9 @@
-// Form with the options for reading and preparing a file; its values are the query of the upload.
+// Form with the options for reading and preparing a file; `queryOf` makes the query of the upload.
 
-import { h } from "../../dom.js";
-import { field } from "../../ui.js";
-import { EFFORTS, robotSelect } from "./robots.js";
+import { Field } from "../../components.js";
+import { html } from "../../preact.js";
+import { LABELS } from "./findings.js";
+import { EFFORTS, RobotChoice } from "./robot_choice.js";
 
 const QUANTITIES = [
   ["t", "time", ["s", "ms", "us", "ns", "min"]],
@@ -12,175 +13,111 @@ const QUANTITIES = [
   ["tau", "torque", ["N*m", "mN*m", "N*cm", "N*mm", "kgf*cm", "A", "mA"]],
   ["episode", "episode", []],
 ];
+const EFFORT = [["", "default of the robot or the file"], ...["measured", "commanded", "current"].map((each) => [each, EFFORTS[each]])];
+const SELECTS = {
+  effort: EFFORT,
+  torque_convention: [["", "derived from the effort"], ["gravity_included", "gravity included"], ["gravity_compensated", "gravity compensated"]],
+  poses: [["", "motion"], ["true", "held poses, one a row"]],
+  delimiter: [["", "auto-detect"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]],
+  filtering: [["", "only if signals are derived (default)"], ["always", "always"], ["never", "never"]],
+  form: [["", "zero-phase (default)"], ["causal", "causal, as in a live stream"]],
+};
+const NUMBERS = { dt: [0.000001, 100], cutoff: [0.01, 1000], rate: [0.01, 1000000], gap: [1.01, 1000000], trim: [0, 1000000] };
+const UNITS = { torque_constants: "N·m/A", cutoff: "Hz", rate: "Hz", gap: "in median time steps", trim: "s", dt: "s" };
+const EXAMPLES = {
+  torque_constants: "0.11, 0.11, 0.08", torque_factors: "1, 1, -1", joint_names: "shoulder, elbow, wrist", joints: "all", drop_joints: "gripper", topic: "/joint_states",
+  column_names: "t,q1..q7,tau1..tau7", dt: "from the file", cutoff: "4", rate: "as recorded", gap: "1.5", trim: "edges affected by the filter",
+};
+const HINTS = {
+  effort: "With a wrong choice, the model learns a wrong torque.",
+  torque_constants: "One for each joint, separated by commas.",
+  torque_factors: "One for each joint; they multiply the torque. Use −1 to reverse the sign.",
+  joint_names: "Required if the file numbers its joints. Separate them with commas.",
+  joints: "In this order. Separate them with commas.",
+  drop_joints: "For example grippers and locked joints.",
+  topic: "Required if several topics of a bag can be read. Topics separated by commas are merged by time.",
+  dt: "For files without times.",
+  poses: "Held poses need no times and velocities.",
+  column_names: "For text without a header.",
+  delimiter: "For CSV files.",
+};
+const JOINTS = ["joint_names", "joints", "drop_joints"];
+const PREPARATION = ["filtering", "cutoff", "form", "rate", "gap", "trim", "torque_convention", "topic", "dt", "poses", "column_names", "delimiter"];
 
-/** Create the form. Returns {element, fill(query), values(), fillRobots(robots)}; values(): query of the upload. */
-export function uploadOptions() {
-  const inputs = {
-    effort: select("effort", [["", "default of the robot or the file"], ...pairs(EFFORTS, ["measured", "commanded", "current"])]),
-    torque_constants: textInput("torque_constants", "0.11, 0.11, 0.08"),
-    torque_factors: textInput("torque_factors", "1, 1, -1"),
-    torque_convention: select("torque_convention", [
-      ["", "derived from the effort"],
-      ["gravity_included", "gravity included"],
-      ["gravity_compensated", "gravity compensated"],
-    ]),
-    joint_names: textInput("joint_names", "shoulder, elbow, wrist"),
-    joints: textInput("joints", "all"),
-    drop_joints: textInput("drop_joints", "gripper"),
-    topic: textInput("topic", "/joint_states"),
-    column_names: textInput("column_names", "t,q1..q7,tau1..tau7"),
-    dt: numberInput("dt", "from the file", "0.000001", "100"),
-    poses: select("poses", [["", "motion"], ["true", "held poses, one a row"]]),
-    delimiter: select("delimiter", [["", "auto-detect"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]]),
-    filtering: select("filtering", [
-      ["", "only if signals are derived (default)"],
-      ["always", "always"],
-      ["never", "never"],
-    ]),
-    cutoff: numberInput("cutoff", "4", "0.01", "1000"),
-    form: select("form", [["", "zero-phase (default)"], ["causal", "causal, as in a live stream"]]),
-    rate: numberInput("rate", "as recorded", "0.01", "1000000"),
-    gap: numberInput("gap", "1.5", "1.01", "1000000"),
-    trim: numberInput("trim", "edges affected by the filter", "0", "1000000"),
+/** The form. value: {option: text, columns: {quantity: text}, units: {quantity: text}}; robots: of `readRobots` by `useRead`. */
+export function ImportOptions({ value, onchange, robots }) {
+  const set = (name, text) => onchange({ ...value, [name]: text });
+  const field = (name) => html`<${Option} key=${name} name=${name} value=${value[name] ?? ""} onchange=${(text) => set(name, text)} />`;
+  const profile = robots.value?.profiles.find((each) => each.name === value.robot);
+  const current = (value.effort || profile?.effort) === "current" || value.torque_constants;
+  return html`<div class="options">
+    <p class="hint">Leave fields empty to auto-detect them. If that is ambiguous, the upload is rejected with a message that names the missing option.</p>
+    <${RobotChoice} reading=${robots} value=${value.robot ?? ""} onchange=${(robot) => set("robot", robot)} none="unspecified" hint="Provides limits, joint order and the meaning of the effort." />
+    <div class="grid">${["effort", ...(current ? ["torque_constants"] : []), "torque_factors"].map(field)}</div>
+    <h3>Columns and units</h3>
+    <${Columns} value=${value} onchange=${onchange} />
+    <h3>Joints</h3>
+    <div class="grid">${JOINTS.map(field)}</div>
+    <h3>Preparation</h3>
+    <p class="hint">Missing velocity and acceleration are derived with a low-pass filter and central differences. The report lists every step.</p>
+    <div class="grid">${PREPARATION.map(field)}</div>
+  </div>`;
+}
+
+function Option({ name, value, onchange }) {
+  const input = (attributes) => {
+    const shared = { ...attributes, name, value };
+    if (SELECTS[name]) return html`<select ...${shared} onChange=${(event) => onchange(event.target.value)}>${SELECTS[name].map(([each, label]) => html`<option value=${each} selected=${each === value}>${label}</option>`)}</select>`;
+    const [min, max] = NUMBERS[name] ?? [];
+    const kind = NUMBERS[name] ? { type: "number", min, max, step: "any" } : { type: "text", autocomplete: "off", spellcheck: false };
+    return html`<input ...${shared} ...${kind} placeholder=${EXAMPLES[name]} onInput=${(event) => onchange(event.target.value)} />`;
   };
-  let expected; // effort of the chosen robot
-  const robot = robotSelect({
-    none: "unspecified",
-    onchange: (profile) => {
-      expected = profile?.effort;
-      showConstants();
-    },
-  });
-  const columns = {}, units = {};
-  const rows = QUANTITIES.map(([name, label, known]) => {
-    columns[name] = textInput(`columns-${name}`, name === "q" ? "{joint}/position" : "auto-detect", `Columns of ${label}`);
-    const list = `units-of-${name}`;
-    units[name] = textInput(`units-${name}`, known[0] ?? "", `Unit of ${label}`);
-    if (known.length) units[name].setAttribute("list", list);
-    return h(
-      "tr",
-      {},
-      h("th", { scope: "row" }, h("code", {}, name), ` ${label}`),
-      h("td", {}, columns[name]),
-      h("td", {}, known.length ? units[name] : "–", known.length ? h("datalist", { id: list }, ...known.map(option)) : ""),
-    );
-  });
+  return html`<${Field} label=${[LABELS[name], UNITS[name]].filter(Boolean).join(", ")} hint=${HINTS[name]} input=${input} />`;
+}
 
-  const constants = field("Torque constants, N·m/A", inputs.torque_constants, "One for each joint, separated by commas.");
-  const showConstants = () => {
-    const current = (inputs.effort.value || expected) === "current";
-    constants.hidden = !current && !inputs.torque_constants.value;
-  };
-  inputs.effort.addEventListener("change", showConstants);
-  showConstants();
+/** Names of columns and units by quantity. */
+function Columns({ value, onchange }) {
+  const input = (kind, quantity, label, more) => html`<input type="text" name=${`${kind}-${quantity}`} aria-label=${label} autocomplete="off" spellcheck=${false} ...${more}
+    value=${value[kind]?.[quantity] ?? ""} onInput=${(event) => onchange({ ...value, [kind]: { ...value[kind], [quantity]: event.target.value } })} />`;
+  const row = ([quantity, label, known]) => html`<tr key=${quantity}>
+    <th scope="row"><code>${quantity}</code> ${label}</th>
+    <td>${input("columns", quantity, `Columns of ${label}`, { placeholder: quantity === "q" ? "{joint}/position" : "auto-detect" })}</td>
+    <td>${known.length ? input("units", quantity, `Unit of ${label}`, { placeholder: known[0], list: `units-of-${quantity}` }) : "–"}
+      ${known.length > 0 && html`<datalist id=${`units-of-${quantity}`}>${known.map((each) => html`<option key=${each} value=${each} />`)}</datalist>`}</td>
+  </tr>`;
+  return html`<div class="scroll" tabindex="0" role="region" aria-label="Columns and units"><table>
+    <caption>Column names of the file: a name, a pattern with {joint}, or names separated by commas</caption>
+    <thead><tr>${["Quantity", "Columns", "Unit"].map((label) => html`<th scope="col">${label}</th>`)}</tr></thead>
+    <tbody>${QUANTITIES.map(row)}</tbody>
+  </table></div>`;
+}
 
-  const element = h(
-    "details",
-    { class: "options" },
-    h("summary", {}, "Import options: robot, units, columns, joints, effort, preparation"),
-    h("p", { class: "hint" }, "Leave fields empty to auto-detect them. If that is ambiguous, the upload is rejected with a message that names the missing option."),
-    h("div", { class: "grid" },
-      field("Robot", robot.select, "Provides limits, joint order and the meaning of the effort."),
-      field("Meaning of the torque column", inputs.effort, "With a wrong choice, the model learns a wrong torque."),
-      constants,
-      field("Torque factors", inputs.torque_factors, "One for each joint; they multiply the torque. Use −1 to reverse the sign."),
-    ),
-    robot.note,
-    robot.add,
-    h("h3", {}, "Columns and units"),
-    h("div", { class: "scroll" }, h("table", {},
-      h("caption", {}, "Column names of the file: a name, a pattern with {joint}, or names separated by commas"),
-      h("thead", {}, h("tr", {}, ...["Quantity", "Columns", "Unit"].map((label) => h("th", { scope: "col" }, label)))),
-      h("tbody", {}, ...rows),
-    )),
-    h("h3", {}, "Joints"),
-    h("div", { class: "grid" },
-      field("Joint names", inputs.joint_names, "Required if the file numbers its joints. Separate them with commas."),
-      field("Joints to keep, in this order", inputs.joints, "Separate them with commas. Default: all."),
-      field("Joints to drop", inputs.drop_joints, "For example grippers and locked joints."),
-    ),
-    h("h3", {}, "Preparation"),
-    h("p", { class: "hint" }, "Missing velocity and acceleration are derived with a low-pass filter and central differences. The report lists every step."),
-    h("div", { class: "grid" },
-      field("Low-pass filter", inputs.filtering),
-      field("Cutoff frequency, Hz", inputs.cutoff),
-      field("Filter type", inputs.form),
-      field("Resampling rate, Hz", inputs.rate),
-      field("Min gap, in median time steps", inputs.gap),
-      field("Trim at both ends, s", inputs.trim),
-      field("Torque convention", inputs.torque_convention),
-      field("Topic", inputs.topic, "Required if several topics of a bag can be read. Topics separated by commas are merged by time."),
-      field("Time from row to row, s", inputs.dt, "For files without times."),
-      field("Rows", inputs.poses, "Held poses need no times and velocities."),
-      field("Column names", inputs.column_names, "For text without a header."),
-      field("Delimiter", inputs.delimiter, "For CSV files."),
-    ),
-  );
+/** Return the value of the form for a query of an upload. */
+export function valueOf(query) {
+  const texts = (json) => Object.fromEntries(Object.entries(JSON.parse(json ?? "{}")).map(([name, what]) => [name, [what].flat().join(", ")]));
+  return { ...query, columns: texts(query.columns), units: texts(query.units) };
+}
 
-  return {
-    element,
-    fillRobots: robot.fill,
-    fill: (given) => {
-      robot.choose(given.robot ?? "");
-      for (const [name, input] of Object.entries(inputs)) input.value = given[name] ?? "";
-      for (const [json, of] of [[given.columns, columns], [given.units, units]])
-        for (const [name, what] of Object.entries(JSON.parse(json ?? "{}"))) of[name].value = [what].flat().join(", ");
-      showConstants();
-    },
-    values: () => {
-      const given = { robot: robot.select.value };
-      for (const [name, input] of Object.entries(inputs)) given[name] = name === "delimiter" ? input.value : input.value.trim();
-      given.columns = json(columns, names);
-      given.units = json(units, (value) => value);
-      return Object.fromEntries(Object.entries(given).filter(([, value]) => value !== ""));
-    },
-  };
+/** Return the query of an upload: only what was entered. */
+export function queryOf({ columns, units, ...others }) {
+  const trimmed = Object.entries(others).map(([name, text]) => [name, name === "delimiter" ? text : text.trim()]);
+  const given = [...trimmed, ["columns", json(columns, names)], ["units", json(units, (text) => text)]];
+  return Object.fromEntries(given.filter(([, text]) => text !== ""));
 }
 
 /** Add an option that the service proposed. */
-export function withOption(values, option, value) {
-  if (option === "drop_joints") return { ...values, drop_joints: [values.drop_joints, value].filter(Boolean).join(",") };
-  return { ...values, [option]: JSON.stringify({ ...JSON.parse(values[option] ?? "{}"), ...value }) };
+export function withOption(query, option, value) {
+  if (option === "drop_joints") return { ...query, drop_joints: [query.drop_joints, value].filter(Boolean).join(",") };
+  return { ...query, [option]: JSON.stringify({ ...JSON.parse(query[option] ?? "{}"), ...value }) };
 }
 
-/** Describe options: robot: ur5, units: q deg. */
-export function describeOptions(values) {
-  return Object.entries(values)
-    .map(([name, value]) => `${name.replaceAll("_", " ")}: ${value.replace(/[{}"[\]]/g, "").replaceAll(":", " ")}`)
-    .join("; ");
+/** Return the entered texts as JSON by quantity; an empty text if there are none. */
+function json(texts, meaning) {
+  const given = Object.entries(texts ?? {}).map(([name, text]) => [name, text.trim()]).filter(([, text]) => text);
+  return given.length ? JSON.stringify(Object.fromEntries(given.map(([name, text]) => [name, meaning(text)]))) : "";
 }
 
-/** Return the entered values as JSON by quantity; an empty text if there are none. */
-function json(inputs, meaning) {
-  const given = Object.entries(inputs).map(([name, input]) => [name, input.value.trim()]).filter(([, value]) => value);
-  return given.length ? JSON.stringify(Object.fromEntries(given.map(([name, value]) => [name, meaning(value)]))) : "";
-}
-
-function names(value) {
-  const parts = value.split(",").map((part) => part.trim()).filter(Boolean);
+function names(text) {
+  const parts = text.split(",").map((part) => part.trim()).filter(Boolean);
   return parts.length > 1 ? parts : parts[0];
-}
-
-function textInput(name, placeholder, label) {
-  const input = h("input", { type: "text", name, placeholder, autocomplete: "off", spellcheck: "false" });
-  if (!label) return input;
-  input.setAttribute("aria-label", label);
-  input.style.minWidth = "8rem"; // the table scrolls if it is too narrow
-  return input;
-}
-
-function numberInput(name, placeholder, min, max) {
-  return h("input", { type: "number", name, placeholder, min, max, step: "any" });
-}
-
-function select(name, options) {
-  return h("select", { name }, ...options.map(([value, label]) => h("option", { value }, label)));
-}
-
-function pairs(known, names) {
-  return names.map((name) => [name, known[name]]);
-}
-
-function option(value) {
-  return h("option", { value });
 }

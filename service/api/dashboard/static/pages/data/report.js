@@ -1,41 +1,37 @@
-// Summary of a data set's report: key figures, warnings and recommendations.
+// Summary of a data set's report: key figures and recommendations.
 
 import { jointVar } from "../../colours.js";
-import { h } from "../../dom.js";
+import { Card, Facts } from "../../components.js";
 import { count, counted, number, seconds, shortNames, when } from "../../format.js";
-import { card, facts } from "../../ui.js";
-import { prose, warningBanner } from "./prose.js";
+import { html } from "../../preact.js";
+import { Prose } from "./findings.js";
 
 const CONVENTIONS = { gravity_included: "gravity included", gravity_compensated: "gravity compensated" };
 const MAX_VISIBLE = 3; // recommendations that are visible at once
 
-/** Return warnings and recommendations, the most important first. */
-export function recommendations({ report, joint_names: joints }) {
+/** The recommendations, the most important first. */
+export function Recommendations({ dataset: { report, joint_names: joints } }) {
   const [first, rest] = [report.advice.slice(0, MAX_VISIBLE), report.advice.slice(MAX_VISIBLE)];
-  const list = (texts, start) => h("ol", { class: "advice", start: String(start) }, texts.map((text) => h("li", {}, withJoints(text, joints))));
-  const made = card(
-    "Recommendations",
-    first.length ? list(first, 1) : h("p", {}, "✓ None. The recording is good for training."),
-    rest.length ? h("details", {}, h("summary", {}, `${rest.length} more`), list(rest, MAX_VISIBLE + 1)) : null,
-  );
-  made.classList.add("todo");
-  if (!first.length) made.classList.add("done");
-  return [warningBanner(report.warnings), made];
+  const list = (texts, start) => html`<ol class="advice" start=${start}>${texts.map((text) => html`<li key=${text}><${WithJoints} text=${text} joints=${joints} /></li>`)}</ol>`;
+  return html`<${Card} title="Recommendations" kind=${first.length ? "todo" : "todo done"}>
+    ${first.length ? list(first, 1) : html`<p>✓ None. The recording is good for training.</p>`}
+    ${rest.length > 0 && html`<details><summary>${rest.length} more</summary>${list(rest, MAX_VISIBLE + 1)}</details>`}
+  <//>`;
 }
 
-/** Show the joints at the beginning of a sentence in their colours. */
-function withJoints(text, joints) {
+/** A sentence with the joints at its beginning in their colours. */
+function WithJoints({ text, joints }) {
   const [, who, what] = /^([^:]+): (.*)$/s.exec(text) ?? [null, "", text];
   const named = who.split(/, | and /);
-  if (!who || !named.every((each) => joints.includes(each))) return prose(text);
+  if (!who || !named.every((each) => joints.includes(each))) return html`<${Prose} text=${text} />`;
   const names = shortNames(joints);
   const all = named.length === joints.length && joints.length > 1;
-  const marks = named.map((each) => h("span", { class: "joint", style: `--own: ${jointVar(joints.indexOf(each))}` }, names[joints.indexOf(each)]));
-  return [h("span", { class: "who" }, all ? "All joints" : marks), " ", prose(what)];
+  const marks = named.map((each) => joints.indexOf(each)).map((index) => html`<span class="joint" key=${index} style=${`--own: ${jointVar(index)}`}>${names[index]}</span>`);
+  return html`<span class="who">${all ? "All joints" : marks}</span> <${Prose} text=${what} />`;
 }
 
-/** Return the key figures in one line; the reader can open the rest. */
-export function summary({ report, joint_names: joints, ...dataset }) {
+/** The key figures in one line; the reader can open the rest. */
+export function Summary({ dataset: { report, joint_names: joints, ...dataset } }) {
   const line = [
     `${counted(report.rows, "sample")} of ${counted(joints.length, "joint")}`,
     report.timing.duration_s === null ? null : seconds(report.timing.duration_s),
@@ -44,18 +40,17 @@ export function summary({ report, joint_names: joints, ...dataset }) {
     CONVENTIONS[dataset.torque_convention] ?? dataset.torque_convention,
     report.robot,
   ];
-  return h(
-    "details",
-    { class: "about" },
-    h("summary", {}, line.filter(Boolean).join(" · ")),
-    facts([
-      ["Rows uploaded", count(report.rows_uploaded)],
-      ["Episodes", count(report.episodes)],
-      ["Derived signals", report.derived.length ? report.derived.join(", ") : "none"],
-      ["Robot", report.robot ?? "unspecified"],
-      ["Uploaded", when(dataset.created_at)],
-      ["ID", h("code", {}, dataset.id)],
-    ]),
-    h("p", {}, h("span", { class: "muted" }, "Joints: "), joints.join(", ")),
-  );
+  const pairs = [
+    ["Rows uploaded", count(report.rows_uploaded)],
+    ["Episodes", count(report.episodes)],
+    ["Derived signals", report.derived.length ? report.derived.join(", ") : "none"],
+    ["Robot", report.robot ?? "unspecified"],
+    ["Uploaded", when(dataset.created_at)],
+    ["ID", html`<code>${dataset.id}</code>`],
+  ];
+  return html`<details class="about">
+    <summary>${line.filter(Boolean).join(" · ")}</summary>
+    <${Facts} pairs=${pairs} />
+    <p><span class="muted">Joints: </span>${joints.join(", ")}</p>
+  </details>`;
 }

@@ -1,122 +1,71 @@
-// Plots of a data set's signals, with a common cursor and zoom. Dragging selects the range to hold out.
+// Signals of a data set as small plots, one a joint and quantity, with a common cursor and zoom. Dragging selects the range to hold out.
 
 import { get, path } from "../../api.js";
-import { h, replace } from "../../dom.js";
-import { count, shortNames } from "../../format.js";
-import { LinkedPlots } from "../../linked.js";
-import { line, plot } from "../../plots.js";
-import { field, loading, select } from "../../ui.js";
-import { valuesTable } from "./values.js";
-import { holdOut } from "./hold_out.js";
+import { Await, Card, Choice, useRead } from "../../components.js";
+import { Export } from "../../exporting.js";
+import { count, number } from "../../format.js";
+import { html, useMemo, useRef, useState } from "../../preact.js";
+import { HoldOut, rangeOf, rowsWithin } from "./hold_out.js";
+import { QUANTITIES, useMultiples } from "./multiples.js";
+import { SignalSet } from "./signal_set.js";
 
 const POINTS = 1000;
 const ALL = "all joints";
-const QUANTITIES = { q: "Position", dq: "Velocity", ddq: "Acceleration", tau: "Torque" };
-const AXES = { t: "time", rows: "sample number" };
-const DRAGS = { zoom: "Zoom all plots", hold: "Select the range to hold out" };
+const AXES = [["t", "time"], ["rows", "sample number"]];
+const DRAGS = [["zoom", "Zoom all plots"], ["hold", "Select the range to hold out"]];
 
-/**
- * Draw the signals of a data set into an element.
- * rows: [first, last) to hold out, null for none; choose(rows): called when the selection changes.
- */
-export async function signals(element, dataset, { rows, choose, signal }) {
-  replace(element, loading("Drawing"));
-  const preview = await get(path`/v1/datasets/${dataset.id}/preview`, { points: POINTS }, signal);
-  const names = shortNames(dataset.joint_names);
-  // the time of each episode may start again: plots over time would overlap
-  const rising = preview.columns.every(({ t }) => t.every((value, index) => index === 0 || value >= t[index - 1]));
-  const shown = { joint: ALL, axis: rising ? "t" : "rows" };
-  const places = Object.fromEntries(Object.keys(QUANTITIES).map((name) => [name, h("div", { class: "strip" })]));
-  const plots = new Map();
-  const values = valuesTable(preview, names, dataset.report.joint_types, (x) => linked.point(x));
-  const held = holdOut(preview, dataset, rows, () => shown.axis, {
-    chosen: (stretch, found) => {
-      linked.shade(stretch);
-      choose(found);
-    },
+/** The card. rows: [first, last) to hold out, null for none; choose(rows): called when the selection changes. */
+export function Signals({ dataset, rows, choose }) {
+  const preview = useRead((signal) => get(path`/v1/datasets/${dataset.id}/preview`, { points: POINTS }, signal), [dataset.id]);
+  return html`<${Card} title="Signals"><${Await} reading=${preview} what="Loading the signals">${(found) => html`<${View} preview=${found} dataset=${dataset} rows=${rows} choose=${choose} />`}<//><//>`;
+}
+
+function View({ preview, dataset, rows, choose }) {
+  const signals = useMemo(() => new SignalSet(preview, dataset), [preview]);
+  const [joint, setJoint] = useState(ALL), [axis, setAxis] = useState(signals.timed ? "t" : "rows"), [drag, setDrag] = useState("zoom");
+  const rising = signals.timed || axis === "rows";
+  const first = rising ? preview.columns[0][axis][0] : null;
+  const [cursor, setCursor] = useState(first);
+  const all = useRef(null);
+  const joints = joint === ALL ? signals.joints.map((_each, index) => index) : [signals.joints.indexOf(joint)];
+  const { places, point, reset } = useMultiples(signals, {
+    joints,
+    axis,
+    stretch: rising ? rangeOf(preview, axis, rows) : null,
+    dragging: drag === "hold",
+    moved: setCursor,
+    chosen: (range) => choose(range && rowsWithin(preview, axis, range)),
   });
-  const linked = new LinkedPlots({ zooms: true, moved: values.show, chosen: held.take });
-
-  const draw = async () => {
-    for (const [quantity, place] of Object.entries(places)) {
-      const columns = preview.columns.filter((each) => each.quantity === quantity);
-      const traces = dataset.joint_names.flatMap((joint, index) => {
-        if (shown.joint !== ALL && shown.joint !== joint) return [];
-        const column = columns.find((each) => each.joint === joint);
-        return column ? [line(...withGaps(column, shown.axis, preview.starts), names[index], index)] : [];
-      });
-      const derived = dataset.report.derived.includes(quantity) ? ", derived" : "";
-      const layout = {
-        title: `${QUANTITIES[quantity]} ${quantity}${derived}`,
-        y: unit(columns[0]?.unit ?? "", dataset.report.joint_types),
-        height: 200,
-        showlegend: false, // the table of values is the legend
-        hovermode: false,
-        dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
-        margin: { l: 62, r: 10, t: 30, b: 26 }, // the same in all plots, so that times are aligned
-        xaxis: { automargin: false, ticksuffix: shown.axis === "t" ? " s" : "" },
-        yaxis: { automargin: false, fixedrange: true },
-        uirevision: shown.axis, // keeps the zoom when the joint changes
-      };
-      const label = `${QUANTITIES[quantity]} ${quantity} of ${shown.joint} against ${AXES[shown.axis]}`;
-      place.setAttribute("aria-label", label);
-      if (plots.has(quantity)) plots.get(quantity).react(traces, layout);
-      else {
-        plots.set(quantity, await plot(place, traces, layout, { label, signal }));
-        if (signal.aborted) return;
-        linked.add(place);
-      }
-    }
-    values.setAxis(shown.axis, rising || shown.axis === "rows");
-    held.setAxis(shown.axis, rising || shown.axis === "rows");
+  const turn = (to) => {
+    setAxis(to);
+    setCursor(signals.timed || to === "rows" ? preview.columns[0][to][0] : null);
+    point(null);
   };
-
-  const drag = select(Object.entries(DRAGS), "zoom", (what) => linked.drag(what === "hold"));
-  replace(
-    element,
-    h(
-      "div",
-      { class: "grid thirds" },
-      field("Joint", select([ALL, ...dataset.joint_names], ALL, (joint) => { shown.joint = joint; values.only(joint === ALL ? null : dataset.joint_names.indexOf(joint)); draw(); })),
-      field("Horizontal axis", select(Object.entries(AXES), shown.axis, (axis) => { shown.axis = axis; draw(); })),
-      field("Drag action", drag),
-    ),
-    h(
-      "div",
-      { class: "signals" },
-      h("div", { class: "beside" }, values.element, held.element),
-      h("div", { class: "strips" }, Object.values(places), h("p", { class: "hint" }, h("button", { type: "button", onclick: () => linked.reset() }, "Reset zoom"), " ", drawnSamples(preview), " Lines have a gap between episodes.")),
-    ),
-  );
-  await draw();
-}
-
-/** Return times or rows, and values, with a gap before each episode. */
-export function withGaps(column, axis, starts) {
-  const x = [], y = [];
-  let next = 0;
-  column.rows.forEach((row, index) => {
-    let breaks = false;
-    while (next < starts.length && starts[next] <= row) breaks = starts[next++] > 0;
-    if (breaks && index > 0) {
-      x.push(column[axis][index]);
-      y.push(null);
-    }
-    x.push(column[axis][index]);
-    y.push(column.values[index]);
-  });
-  return [x, y];
-}
-
-/** Return the unit of "rad or m" that applies to all joints; both if types differ or are unknown. */
-function unit(units, types) {
-  const [revolute, prismatic] = units.split(" or ");
-  if (types?.every((type) => type === "revolute")) return revolute;
-  return types?.every((type) => type === "prismatic") ? prismatic : units;
-}
-
-function drawnSamples(preview) {
-  const drawn = Math.max(...preview.columns.map((column) => column.rows.length));
-  if (drawn >= preview.samples) return `Showing all ${count(preview.samples)} samples.`;
-  return `Showing ${count(drawn)} points of ${count(preview.samples)} samples: the minimum and the maximum of each interval.`;
+  const at = rising ? cursor : null;
+  const move = (x) => {
+    setCursor(x);
+    point(x);
+  };
+  const ends = [preview.columns[0][axis][0], preview.columns[0][axis].at(-1)];
+  const text = at === null ? "The times of the episodes overlap" : axis === "t" ? `At ${number(at, 5)} s` : `At sample ${count(at)}`;
+  return html`
+    <div class="grid thirds">
+      <${Choice} label="Joint" options=${[ALL, ...signals.joints]} value=${joint} onchange=${setJoint} />
+      <${Choice} label="Horizontal axis" options=${AXES} value=${axis} onchange=${turn} />
+      <${Choice} label="Drag action" options=${DRAGS} value=${drag} onchange=${setDrag} />
+    </div>
+    <div class="cursor-bar">
+      <output>${text}</output>
+      <input type="range" step="any" aria-label="Cursor" min=${ends[0]} max=${ends[1]} disabled=${!rising} value=${at ?? ends[0]} aria-valuetext=${text} onInput=${(event) => move(event.target.valueAsNumber)} />
+    </div>
+    <div class="quantities" ref=${all}>${QUANTITIES.map(([quantity, name], index) => html`<section key=${quantity} aria-label=${name}>
+      <h3>${name} <span class="muted">${[quantity, dataset.report.derived.includes(quantity) && "derived", !signals.types && signals.units(quantity)].filter(Boolean).join(", ")}</span></h3>
+      <div class="multiple" style=${`--rows: ${joints.length}; --row: ${signals.rowHeight(joints.length)}px`}>
+        <div class="strip" ref=${places[index]}></div>
+        <ul aria-label=${`${name} at the cursor`}>${joints.map((each) => html`<li key=${each}><span class="joint" style=${`--own: ${signals.colour(each)}`} title=${signals.joints[each]}>${signals.names[each]}</span><output>${signals.valueAt(quantity, each, axis, at)}</output></li>`)}</ul>
+      </div>
+    </section>`)}</div>
+    <div class="row below"><button type="button" onClick=${reset}>Reset zoom</button><p class="hint">${signals.drawn()} Lines have a gap between episodes.</p>
+      <${Export} name=${`signals of ${dataset.name}`} of=${() => all.current} table=${() => signals.table(joints)} /></div>
+    <${HoldOut} preview=${preview} dataset=${dataset} rows=${rows} axis=${axis} rising=${rising} choose=${choose} />`;
 }

@@ -1,9 +1,9 @@
 // Error of an upload: its cause and what to do.
 
 import { ApiError } from "../../api.js";
-import { h } from "../../dom.js";
+import { Button, Table } from "../../components.js";
 import { sentence } from "../../format.js";
-import { button, table } from "../../ui.js";
+import { html } from "../../preact.js";
 
 const ADVICE = {
   unreachable: "The recording may have been stored. Check the list before you retry.",
@@ -15,38 +15,26 @@ const ADVICE = {
   rate_limited: "Too many requests. Retry in a moment.",
   forbidden: "This API key may not upload data. Use a key with the scope train.",
 };
+const COLUMNS = [
+  { label: "Field", cell: (row) => html`<code>${row.field}</code>` },
+  { label: "Found", cell: (row) => (typeof row.value === "object" ? JSON.stringify(row.value) : row.value ?? "–") },
+  { label: "Expected", cell: (row) => row.expected },
+];
 
-/**
- * Return an alert for a file that could not be imported.
- * accept(option, value): upload this file again with a proposed option; again(): upload it with the same options.
- */
-export function uploadError(name, error, accept, again) {
+/** An alert for a file that could not be imported. accept(option, value): import it with a proposed option; again(): with the same options. */
+export function UploadError({ name, error, accept, again }) {
   const detail = error instanceof ApiError ? (error.detail ?? []) : [];
-  const known = detail.length > 0;
-  const offers = detail.flatMap((each) => suggestions(each.expected)).map((each) =>
-    button(`Set ${each.label} and retry`, () => accept(each.option, each.value)),
-  );
-  const advice = ADVICE[error.code] ?? (known ? "Correct the file, or set the import options below." : "");
-  return h(
-    "div",
-    { class: "error", role: "alert" },
-    h("p", {}, h("strong", {}, error.status === 0 ? `${name}: no connection. ` : `${name} could not be imported. `), known ? "Nothing was stored. " : "", sentence(error.message)),
-    detail.length > 1 ? problems(detail) : "",
-    advice ? h("p", {}, advice) : "",
-    h("div", { class: "actions" }, ...offers, button("Retry", again)),
-  );
-}
-
-function problems(detail) {
-  return table(
-    [
-      { label: "Field", cell: (row) => h("code", {}, row.field) },
-      { label: "Found", cell: (row) => row.value ?? "–" },
-      { label: "Expected", cell: (row) => row.expected },
-    ],
-    detail,
-    { caption: "Details" },
-  );
+  const advice = ADVICE[error.code] ?? (detail.length ? "Correct the file, or set the import options." : "");
+  const offers = detail.flatMap((each) => suggestions(each.expected));
+  return html`<div class="error" role="alert">
+    <p><strong>${error.status === 0 ? `${name}: no connection.` : `${name} could not be imported.`}</strong> ${detail.length > 0 && "Nothing was stored. "}${sentence(error.message)}</p>
+    ${detail.length > 1 && html`<${Table} columns=${COLUMNS} rows=${detail} caption="Details" />`}
+    ${advice && html`<p>${advice}</p>`}
+    <div class="actions">
+      ${offers.map((each) => html`<${Button} key=${each.label} onclick=${() => accept(each.option, each.value)}>Set ${each.label} and retry<//>`)}
+      <${Button} key="again" onclick=${again}>Retry<//>
+    </div>
+  </div>`;
 }
 
 /** Find the options that a message proposes, as {option, value, label}: units={"q": "deg"}, drop_joints=gripper. */
