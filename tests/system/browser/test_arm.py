@@ -25,6 +25,11 @@ UPRIGHT = """async (gravity) => {
   const { times, gravityAlignment } = await import("/dashboard/pages/arm/kinematics.js");
   return times(gravityAlignment(gravity), gravity);
 }"""
+SEEN = """async ([points, ratio]) => {
+  const { acrossPlane, eyeFor } = await import("/dashboard/pages/arm/camera.js");
+  const direction = acrossPlane(points);
+  return [direction, eyeFor(direction, [1, 0.6, 0.8], ratio, false)];
+}"""
 LINKS = "(plot) => plot.data[0].x"
 """Coordinates of the frames along one axis, in Plotly's data."""
 
@@ -56,24 +61,59 @@ def test_gravity_points_down_in_the_drawing(visitor: Visitor) -> None:
         np.testing.assert_allclose(down, [0, 0, -np.linalg.norm(gravity)], atol=1e-9)
 
 
+@pytest.mark.parametrize("normal", [[1.0, 0.0, 0.0], [0.6, -0.8, 0.0], [0.0, 0.0, 1.0]])
+@pytest.mark.parametrize("ratio", [2.2, 0.8], ids=["desktop", "phone"])
+def test_camera_sees_the_whole_scene_across_the_plane_of_the_arm(
+    visitor: Visitor, normal: list[float], ratio: float
+) -> None:
+    rng = np.random.default_rng(0)
+    across = np.linalg.svd([normal])[2][1:]
+    points = rng.standard_normal((7, 2)) @ across
+    direction, eye = visitor.open("#/train").evaluate(SEEN, [points.tolist(), ratio])
+    assert abs(np.dot(direction, normal)) > 0.8
+    position = np.array([eye["x"], eye["y"], eye["z"]])
+    right = np.cross([0, 0, 1], direction)
+    right /= np.linalg.norm(right)
+    corners = np.array(np.meshgrid([-0.5, 0.5], [-0.3, 0.3], [-0.4, 0.4])).reshape(3, -1).T
+    away, tangent = (position - corners) @ direction, np.tan(np.pi / 8)  # half of the angle of Plotly's camera
+    assert (abs(corners @ right) < away * tangent * ratio).all()
+    assert (abs(corners @ np.cross(direction, right)) < away * tangent).all()
+
+
+def test_every_joint_of_the_drawing_has_its_colour(visitor: Visitor, arm: str) -> None:
+    page = visitor.open(f"#/models/{arm}?tab=arm")
+    figure = page.get_by_role("img", name=re.compile("The arm in 3-D"))
+    expect(figure.locator("canvas").first).to_be_visible()
+    links, *lines = figure.evaluate(
+        "(plot) => plot.data.filter((each) => each.mode === 'lines').map((e) => e.line.color)"
+    )
+    key = page.locator(".arm-stage .key .joint")
+    expect(key).to_have_count(7)
+    colours = key.evaluate_all("(all) => all.map((each) => getComputedStyle(each, '::before').backgroundColor)")
+    drawn = {tuple(int(line[at : at + 2], 16) for at in (1, 3, 5)) for line in lines if line.startswith("#")}
+    assert {tuple(int(part) for part in re.findall(r"\d+", each)) for each in colours} <= drawn
+    assert links not in lines
+
+
 def test_arm_is_drawn_and_moves_with_the_sliders(visitor: Visitor, arm: str) -> None:
     page = visitor.open(f"#/models/{arm}?tab=arm")
     figure = page.get_by_role("img", name=re.compile("The arm in 3-D, 7 joints from base to tip"))
     expect(figure.locator("canvas").first).to_be_visible()
     before = figure.evaluate(LINKS)
     assert len(before) == 8
-    page.get_by_text("Change posture").click()
     slider = page.get_by_role("slider", name="Position of panda_joint2")
     slider.focus()
     slider.press("End")
     visitor.until(lambda: figure.evaluate(LINKS) != before)
     page.get_by_role("button", name="Reset posture").click()
     visitor.until(lambda: figure.evaluate(LINKS) == before)
-    joints = page.get_by_role("table", name=re.compile("Joint axes from base to tip"))
-    expect(joints.get_by_role("row").last).to_contain_text("shift 2")
-    expect(page.get_by_role("table", name=re.compile("Bodies in their joint frames"))).to_contain_text(
-        "mass, first moment"
-    )
+    axes = page.get_by_role("region", name="Axes and centres of mass").get_by_role("table")
+    expect(axes.get_by_role("row").last).to_contain_text("shift 2")
+    expect(axes).to_contain_text("mass, first moment")
+    parameters = page.get_by_role("region", name="Masses and friction").get_by_role("table")
+    expect(parameters.get_by_role("columnheader", name="Mass, kg")).to_be_visible()
+    expect(parameters.get_by_role("columnheader", name="Coulomb, N·m")).to_be_visible()
+    page.get_by_role("region", name="Learnt arm").get_by_text("How to read this").click()
     expect(page.get_by_text("does not distinguish an arm from its mirror image")).to_be_visible()
     with page.expect_download() as saved:
         page.get_by_role("button", name="Save as URDF").click()

@@ -101,12 +101,12 @@ def judged(visitor: Visitor) -> None:
     page.get_by_label("Part", exact=True).select_option("all")
     expect(page.get_by_text("Optimistic figures").first).to_be_visible()
 
-    page.get_by_role("tab", name="Components and friction").click()
+    page.get_by_role("tab", name="Components").click()
     drawn(page.locator("main"))
     assert audit(page) == []
     page.get_by_role("tab", name="Predict").click()
-    page.get_by_role("button", name="Predict", exact=True).click()
-    expect(page.get_by_role("columnheader", name="95 % interval of measurements")).to_be_visible()
+    page.get_by_text("All numbers").click()
+    expect(page.get_by_role("columnheader", name="95 % band")).to_be_visible()
 
 
 def promoted(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:

@@ -20,6 +20,21 @@ if TYPE_CHECKING:
 
 
 ROWS = 1200
+COVERED = """() => {
+  const kinds = ".joint, .measure > span, .answer strong, .badge, .dial > *";
+  const seen = [...document.querySelectorAll(kinds)].filter((each) => each.checkVisibility());
+  const boxes = seen.map((each) => [each, each.getBoundingClientRect()]);
+  const beside = (a, b) => a.right <= b.left + 1 || b.right <= a.left + 1;
+  const above = (a, b) => a.bottom <= b.top + 1 || b.bottom <= a.top + 1;
+  return boxes.flatMap(([one, a], at) => boxes.slice(at + 1)
+    .filter(([other, b]) => !one.contains(other) && !other.contains(one) && !beside(a, b) && !above(a, b))
+    .map(([other]) => `${one.outerHTML} covers ${other.outerHTML}`));
+}"""
+"""Names, values and controls that cover another one."""
+CUT = """() => [...document.querySelectorAll(".joint, .measure > span, .answer strong, .dial input[type=number]")]
+  .filter((each) => each.scrollWidth > each.clientWidth + 1 && getComputedStyle(each).display !== "inline")
+  .map((each) => each.outerHTML)"""
+"""Names and values that are wider than their place."""
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +104,7 @@ def test_model_without_matching_recording_asks_for_an_upload(visitor: Visitor) -
     page = visitor.open("#/models/panda-sim")
     expect(page.get_by_text("has the joints of this model (panda_joint1")).to_be_visible()
     expect(page.get_by_role("link", name="Upload a recording")).to_be_visible()
-    page.get_by_role("tab", name="Components and friction").click()
+    page.get_by_role("tab", name="Arm and friction").click()
     expect(page.get_by_role("table").filter(has_text="Coulomb")).to_contain_text("joint7")
     assert audit(page) == []
 
@@ -121,12 +136,75 @@ def test_lineage_links_to_data_set_and_job(visitor: Visitor, dashboard: Dashboar
 
 def test_prediction_outside_the_training_range_shows_a_warning(visitor: Visitor, model: str) -> None:
     page = visitor.open(f"#/models/{model}?tab=ask")
-    page.get_by_role("button", name="Predict", exact=True).click()
-    expect(page.get_by_text("✓ within")).to_have_count(2)
+    answer = page.get_by_role("region", name="Predicted torque")
+    expect(answer.get_by_role("listitem")).to_have_count(2)
+    expect(page.get_by_text("outside", exact=False).filter(has_text="dq")).to_have_count(0)
     page.get_by_label("dq of joint2", exact=True).fill("40")
-    page.get_by_role("button", name="Predict", exact=True).click()
     expect(page.get_by_text("dq outside")).to_be_visible()
     expect(page.get_by_text("Do not send this torque to a robot without a check")).to_be_visible()
+    assert audit(page) == []
+
+
+def test_sliders_set_the_state_and_the_torque_is_shown_with_its_components(
+    visitor: Visitor, dashboard: Dashboard, model: str
+) -> None:
+    page = visitor.open(f"#/models/{model}?tab=ask")
+    version = dashboard.client.get(f"/v1/models/{model}/versions/1").json()
+    slider = page.get_by_role("slider", name="q of joint1, slider", exact=True)
+    slider.focus()
+    slider.press("End")
+    highest = version["training_range"]["q"]["max"][0]
+    q = float(page.get_by_label("q of joint1", exact=True).input_value())
+    assert q == pytest.approx(highest, abs=1e-2)
+    middle = float(page.get_by_label("q of joint2", exact=True).input_value())
+    state = {"q": [q, middle], "dq": [0.0, 0.0], "ddq": [0.0, 0.0], "components": ["gravity", "friction"]}
+    found = dashboard.client.post(f"/v1/models/{model}/predict", json=state).json()
+    bar = page.get_by_role("region", name="Predicted torque").get_by_role("listitem").first.get_by_role("img")
+    for name in ("gravity", "friction"):
+        expect(bar).to_have_attribute("aria-label", re.compile(f"{name} {found['components'][name]['mean'][0]:.3g}"))
+    page.get_by_role("button", name="At rest, middle of the range").click()
+    expect(bar).not_to_have_attribute(
+        "aria-label", re.compile(f"gravity {found['components']['gravity']['mean'][0]:.3g}")
+    )
+
+
+@pytest.fixture(scope="module")
+def named(dashboard: Dashboard) -> str:
+    """A model of joints with long names."""
+    recorded = replace(stream(samples=120, seed=5), joint_names=("left_shoulder_lift_joint", "left_wrist_3_joint"))
+    data = upload(dashboard.client, recorded, name="long names.npz")
+    train(dashboard.client, "long-names", data["id"], holdout={"share": 0.3})
+    return "long-names"
+
+
+@pytest.mark.parametrize("tab", ["accuracy", "ask", "parts"])
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_long_joint_names_cover_nothing_and_no_value_is_cut(
+    windows: Visit, dashboard: Dashboard, named: str, tab: str, size: tuple[int, int]
+) -> None:
+    visitor = windows(dashboard.server.url, size=size)
+    page = visitor.open(f"#/models/{named}?tab={tab}")
+    expect(page.locator("main .joint").first).to_have_text("shoulder_lift")
+    assert visitor.overflow() <= 0
+    assert page.evaluate(COVERED) == []
+    assert page.evaluate(CUT) == []
+
+
+def test_warnings_are_chips_that_open_their_text(visitor: Visitor, model: str) -> None:
+    texts = ["The fit did not converge. Train with `max_iterations` 500.", "The joints moved together: by 0.5 rad."]
+
+    def warned(route: Route) -> None:
+        route.fulfill(json={**route.fetch().json(), "warnings": texts})
+
+    visitor.page.route("**/versions/1", warned)
+    page = visitor.open(f"#/models/{model}?tab=lineage")
+    chips = page.get_by_role("region", name="Warnings")
+    expect(chips.locator("summary")).to_have_text(["! The fit did not converge", "! The joints moved together"])
+    text = chips.get_by_text("Train with max_iterations 500.")
+    expect(text).to_be_hidden()
+    chips.locator("summary").first.press("Enter")
+    expect(text).to_be_visible()
+    expect(text.locator("code")).to_have_text("max_iterations")
     assert audit(page) == []
 
 
@@ -144,7 +222,9 @@ def test_candidate_shows_its_reason_and_can_be_served(visitor: Visitor, dashboar
     page = visitor.open(f"#/models/waits?version=2&dataset={second}&part=held_out")
     expect(page.get_by_text(reason).first).to_be_visible()
     expect(page.get_by_text("✕ wrong").first).to_be_visible()
-    page.get_by_role("button", name="Serve version 2 anyway").click()
+    serve = page.get_by_role("button", name="Serve version 2 anyway")
+    expect(serve).to_have_class("danger")
+    serve.click()
     page.get_by_role("dialog").get_by_role("button", name="Serve version 2 anyway").click()
     expect(page.get_by_text("Version 2 of waits is now serving.")).to_be_visible()
     assert audit(page) == []
@@ -190,10 +270,10 @@ def test_model_page_opens_with_the_held_out_part(visitor: Visitor, dashboard: Da
 def test_coverage_and_verdict_fit_on_a_phone(windows: Visit, dashboard: Dashboard, model: str) -> None:
     visitor = windows(dashboard.server.url, size=PHONE, touch=True)
     page = visitor.open(f"#/models/{model}")
-    joints = page.get_by_role("region", name="Verdict on this recording").get_by_role("listitem")
+    joints = page.get_by_role("region", name="Verdict", exact=True).get_by_role("listitem")
     expect(joints).to_have_count(2)
     for joint in joints.all():
-        for part in (joint.get_by_role("img", name="95 % coverage"), joint.locator(".badge")):
+        for part in (*joint.get_by_role("img").all(), joint.locator(".badge")):
             box = part.bounding_box()
             assert box is not None
             assert box["x"] >= 0

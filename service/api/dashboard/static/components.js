@@ -24,7 +24,7 @@ export function useRead(read, inputs, period = null) {
     const stop = new AbortController();
     let timer = null;
     const look = async () => {
-      if (!document.hidden) {
+      if (!period || !document.hidden) {
         try {
           const value = await read(stop.signal);
           if (!stop.signal.aborted) setState({ value, error: null, at: Date.now() });

@@ -89,13 +89,14 @@ export function torqueUnit(type) {
   return type === "prismatic" ? "N" : "N·m";
 }
 
-/** Return joint names without the prefix that all joints share: panda_joint1 → joint1. */
+/** Return joint names without the prefix and the suffix that all joints share: panda_joint1 → joint1, elbow_joint → elbow. */
 export function shortNames(names) {
   if (names.length < 2) return [...names];
-  let end = 0;
-  while (names.every((name) => name[end] !== undefined && name[end] === names[0][end])) end += 1;
-  const cut = Math.max(...[..."_/."].map((mark) => names[0].lastIndexOf(mark, end - 1))) + 1;
-  return names.map((name) => name.slice(cut) || name);
+  const parts = names.map((name) => name.split(/(?<=[_/.])/)); // each part ends with its mark
+  const shared = (at) => parts.every((each) => each.length > 1 && each.at(at) === parts[0].at(at));
+  while (shared(0)) for (const each of parts) each.shift();
+  while (shared(-1)) for (const each of parts) each.pop();
+  return parts.map((each) => each.join("").replace(/[_/.]$/, ""));
 }
 
 /** Return text from the service as a sentence: a capital first letter and a full stop. */

@@ -1,123 +1,110 @@
-// One model: accuracy, parameters, versions, online learning, and a form for predictions.
+// One model: its verdict, accuracy, components, arm, versions, lineage, predictions and online learning.
 
 import { get, pages, path } from "../api.js";
-import { h, refresh, replace } from "../dom.js";
+import { Await, Badge, Button, Heading, Link, page, Tabs, useRead } from "../components.js";
 import { when } from "../format.js";
-import { badge, button, errorBox, heading, link, loading, notice, tabs } from "../ui.js";
-import { warningBanner } from "./data/prose.js";
-import { accuracy } from "./model/accuracy.js";
-import { arm } from "./model/arm.js";
-import { predictForm } from "./model/predict.js";
-import { chooser, firstChoice } from "./model/choice.js";
-import { learning } from "./model/learning.js";
-import { lineage } from "./model/lineage.js";
-import { parts } from "./model/parts.js";
-import { promotionNote } from "./model/promotion.js";
+import { JointVerdicts } from "../jointverdicts.js";
+import { html, useEffect, useRef, useState } from "../preact.js";
+import { notice } from "../ui.js";
+import { VerdictNote } from "../verdicts.js";
+import { Warnings } from "../warnings.js";
+import { Accuracy } from "./model/accuracy.js";
+import { Arm } from "./model/arm.js";
+import { chooseData, Choices } from "./model/choice.js";
+import { Components } from "./model/parts.js";
+import { Learning } from "./model/learning.js";
+import { Lineage } from "./model/lineage.js";
+import { Predict } from "./model/predict.js";
 import { moveAlias, servingButton } from "./model/serving.js";
-import { versions } from "./model/versions.js";
-import { verdictNote } from "./verdict.js";
+import { Versions } from "./model/versions.js";
 
-/** Tabs: name in the address, label, function that draws it, selects above the tabs that it uses. */
+/** Tabs: name in the address, label, component, selects above the tabs that it uses. */
 const TABS = [
-  ["accuracy", "Accuracy", accuracy, { data: true, version: true }],
-  ["parts", "Components and friction", parts, { data: true, version: true }],
-  ["arm", "Arm", arm, { version: true }],
-  ["versions", "Versions", versions, {}],
-  ["lineage", "Lineage", lineage, { version: true }],
-  ["ask", "Predict", predictForm, { version: true }],
-  ["learning", "Learning", learning, {}],
+  ["accuracy", "Accuracy", Accuracy, ["version", "data"]],
+  ["parts", "Components", Components, ["version", "data"]],
+  ["arm", "Arm and friction", Arm, ["version"]],
+  ["versions", "Versions", Versions, []],
+  ["lineage", "Lineage", Lineage, ["version"]],
+  ["ask", "Predict", Predict, ["version"]],
+  ["learning", "Learning", Learning, []],
 ];
 
-/** The page `#/models/{name}`; `?version=2&dataset=ID&part=held_out&tab=versions` sets the selects and the tab. */
-export async function render(view, { name, query }, { signal, title }) {
-  title(name);
-  const where = path`/v1/models/${name}`;
-  const [model, datasets] = await Promise.all([get(where, {}, signal), pages("/v1/datasets", 200, {}, signal)]);
-  const requested = Number(query.get("version"));
-  const number = model.versions.some((each) => each.version === requested) ? requested : defaultVersion(model);
-  const version = await get(`${where}/versions/${number}`, {}, signal);
-  const state = { name, where, model, version, datasets, ...firstChoice(version, datasets, query) };
-  state.tab = TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : "accuracy";
-
-  const choice = h("div", { class: "grid" }), panel = h("div", { role: "tabpanel" });
-  let shownTab = new AbortController();
-  signal.addEventListener("abort", () => shownTab.abort());
-
-  const show = async () => {
-    shownTab.abort();
-    shownTab = new AbortController();
-    const mine = shownTab.signal;
-    const [tab, label, draw, needs] = TABS.find(([each]) => each === state.tab);
-    remember(state);
-    updateTop();
-    choose(needs);
-    panel.setAttribute("aria-label", label);
-    const inner = h("div", { dataset: { tab } });
-    replace(panel, inner);
-    try {
-      await draw(inner, state, { signal: mine, reload, select, show });
-    } catch (error) {
-      if (mine.aborted || error.name === "AbortError") return;
-      if (error.name !== "ApiError") console.error(error);
-      replace(inner, errorBox(error, show));
-    }
+/** The page `#/models/{name}`; `?version=2&dataset=ID&part=all&tab=versions` sets the selects and the tab. */
+function Model({ name, query, title }) {
+  useEffect(() => title(name), [name]);
+  const where = path`/v1/models/${name}`, done = useRef(null);
+  const found = useRead((signal) => Promise.all([
+    get(where, {}, signal), get(`${where}/aliases`, {}, signal), pages("/v1/datasets", 200, {}, signal),
+  ]), [where]);
+  // after a change, the notice comes with the new state, so that no button of the old state can be pressed
+  useEffect(() => {
+    if (done.current) notice(done.current);
+    done.current = null;
+  }, [found.value, found.error]);
+  const changed = (text) => {
+    done.current = text;
+    found.reload();
   };
-  /** Show another version. */
-  const select = async (chosen, tab = state.tab) => {
-    replace(panel, loading());
-    state.version = await get(`${where}/versions/${chosen}`, {}, signal);
-    Object.assign(state, firstChoice(state.version, datasets, new URLSearchParams({ dataset: state.dataset ?? "" })));
-    if (tab !== state.tab) list.querySelector(`[data-name="${tab}"]`).click();
-    else await show();
-  };
-  /** Read the model again after a change. */
-  const reload = async () => {
-    state.model = await get(where, {}, signal);
-    if (!state.model.versions.some((each) => each.version === state.version.version)) await select(defaultVersion(state.model));
-    else await show();
-  };
-
-  const [top, updateTop] = header(state, reload);
-  const choose = chooser(choice, state, show, select);
-  const list = tabs(TABS.map(([tab, label]) => [tab, label]), (tab) => {
-    state.tab = tab;
-    show();
-  }, state.tab);
-  list.setAttribute("aria-label", `Model ${name}`);
-  replace(view, top, choice, list, panel);
+  return html`<${Await} reading=${found}>${([model, { items: aliases }, datasets]) => html`<${Shown} model=${model} aliases=${aliases} datasets=${datasets} where=${where} query=${query} changed=${changed} />`}<//>`;
 }
 
-/** Return the version that is shown by default. */
-function defaultVersion(model) {
-  return model.serving_version ?? model.latest_version;
+function Shown({ model, aliases, datasets, where, query, changed }) {
+  const [wanted, setWanted] = useState(() => ({ version: Number(query.get("version")), dataset: query.get("dataset"), part: query.get("part") }));
+  const [tab, setTab] = useState(() => (TABS.some(([each]) => each === query.get("tab")) ? query.get("tab") : "accuracy"));
+  const number = model.versions.some((each) => each.version === wanted.version) ? wanted.version : model.serving_version ?? model.latest_version;
+  const version = useRead((signal) => get(`${where}/versions/${number}`, {}, signal), [where, number]);
+  return html`<${Await} reading=${version}>${(found) => html`<${VersionPage} ...${{ model, aliases, datasets, where, version: found, wanted, setWanted, tab, setTab, changed }} />`}<//>`;
 }
 
-/** Create the header with actions and the shown version. Returns its element and a function that updates it. */
-function header(state, reload) {
-  const { name } = state;
-  const promote = button("", async () => {
-    if (!(await moveAlias(state, "serving", state.version))) return;
-    notice(`Version ${state.version.version} of ${name} is now serving.`);
-    await reload();
-  });
-  const actions = h("div", { class: "actions" }), about = h("div", {});
-  const follow = link("Follow live", `#/live/${encodeURIComponent(name)}`);
-  const train = link("Train a new version", `#/train?model=${encodeURIComponent(name)}`);
-  const update = () => {
-    const { version, model: { serving_version: serving, aliases } } = state;
-    const shown = version.version;
-    const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
-    [promote.textContent, promote.className] = servingButton(version);
-    refresh(actions, shown === serving ? badge("serving") : promote, follow, train);
-    const other = serving === null ? "no version is serving" : `version ${serving} is serving`;
-    const answers = shown === serving ? `Version ${shown} is serving` : `Viewing version ${shown} · ${other}`;
-    refresh(about, h("p", { class: "muted" }, [answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")), verdictNote(version.verdict), promotionNote(version), warningBanner(version.warnings));
+function VersionPage({ tab, setTab, wanted, setWanted, ...given }) {
+  const { model, version, datasets } = given;
+  const { dataset, part } = chooseData(version, datasets, wanted);
+  const [, , Panel, needs] = TABS.find(([each]) => each === tab);
+  const search = new URLSearchParams({ version: version.version, ...(dataset ? { dataset: dataset.id } : {}), ...(part === "all" ? { part } : {}), tab });
+  useEffect(() => history.replaceState(null, "", `#/models/${encodeURIComponent(model.name)}?${search}`), [String(search)]);
+  const view = (number, shown = tab) => {
+    setWanted({ version: number, dataset: dataset?.id, part: null });
+    setTab(shown);
   };
-  return [h("div", {}, heading(name, actions), about), update];
+  const state = { ...given, dataset, part, view };
+  return html`
+    <${Header} ...${state} />
+    <${Verdict} version=${version} open=${tab === "accuracy"} />
+    <${Choices} ...${state} needs=${needs} setWanted=${setWanted} />
+    <${Tabs} label=${`Model ${model.name}`} options=${TABS} chosen=${tab} onchoose=${setTab}>
+      <${Panel} key=${[tab, version.version, dataset?.id, part].join()} ...${state} />
+    <//>`;
 }
 
-/** Keep the selection in the address, so that it can be shared; do not navigate. */
-function remember({ name, version, dataset, part, tab }) {
-  const search = new URLSearchParams({ version: version.version, ...(dataset ? { dataset } : {}), ...(part === "all" ? {} : { part }), tab });
-  history.replaceState(null, "", `#/models/${encodeURIComponent(name)}?${search}`);
+function Header({ model, where, version, changed }) {
+  const { name, serving_version: serving, aliases } = model, shown = version.version;
+  const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
+  const [label, kind] = servingButton(version);
+  const serve = async () => {
+    if (await moveAlias({ name, where, model }, "serving", version)) changed(`Version ${shown} of ${name} is now serving.`);
+  };
+  const other = serving === null ? "no version is serving" : `version ${serving} is serving`;
+  const answers = shown === serving ? `Version ${shown} is serving` : `Viewing version ${shown} · ${other}`;
+  return html`
+    <${Heading} text=${name}>
+      <div class="actions">
+        ${shown === serving ? html`<${Badge} state="serving" />` : html`<${Button} key=${label} kind=${kind} onclick=${serve}>${label}<//>`}
+        <${Link} to=${`#/live/${encodeURIComponent(name)}`}>Follow live<//>
+        <${Link} to=${`#/train?model=${encodeURIComponent(name)}`}>Train a new version<//>
+      </div>
+    <//>
+    <p class="muted">${[answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")}</p>`;
 }
+
+function Verdict({ version, open }) {
+  const { verdict, promotion, warnings } = version;
+  return html`<section class="card" aria-label="Verdict">
+    <${VerdictNote} verdict=${verdict} />
+    ${promotion?.answers && !verdict.serves && html`<p class="hint">Version ${version.version} was promoted, although it is ${verdict.label}.</p>`}
+    ${promotion && !promotion.answers && verdict.serves && html`<p class="banner" role="note"><strong>Version ${version.version} is a candidate.</strong> ${promotion.reason}</p>`}
+    <${Warnings} texts=${warnings} />
+    ${verdict.joints.length > 0 && html`<details class="by-joint" open=${open}><summary>Joints</summary><${JointVerdicts} verdict=${verdict} /></details>`}
+  </section>`;
+}
+
+export const render = page(Model);

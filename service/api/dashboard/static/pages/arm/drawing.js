@@ -3,12 +3,12 @@
 import { css, withOpacity, jointColour } from "../../colours.js";
 import { shortNames } from "../../format.js";
 import { escapeMarkup, plot } from "../../plots.js";
+import { acrossPlane, eyeFor } from "./camera.js";
 import { add, frames, gravityAlignment, massCentres, scaled, times } from "./kinematics.js";
 
 const AXIS = 0.12; // half-length of an axis, relative to the size of the arm
 const ROUND = 24; // vertices of a disc
-const MARGIN = 0.15;
-const EYE = { x: 1.1, y: -1.1, z: 0.5 }; // far enough to show the whole arm
+const MARGIN = 0.05;
 const HIGHLIGHT_PX = 20; // width of the highlighted axis
 const MIN_MASS_PX = 7, MAX_MASS_PX = 24;
 
@@ -26,18 +26,27 @@ export async function drawing(element, { joint_names: names, parameters, trainin
   const arm = new Arm(names, parameters, range);
   const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables contain the same values.`;
   let last = q;
-  const layout = (shown) => arm.layout(shown, height, legend);
+  const layout = () => arm.layout(height, element.clientWidth / height, legend);
   const first = arm.at(last);
-  const made = await plot(element, arm.traces(first), layout(first), { label, signal });
+  const made = await plot(element, arm.traces(first), layout(), { label, signal });
   const draw = (positions, thick = arm.thick) => {
     last = positions;
     arm.thick = thick;
     const shown = arm.at(last);
-    return made.react(arm.traces(shown), layout(shown));
+    return made.react(arm.traces(shown), layout());
   };
   const again = () => (element.isConnected ? draw(last) : null);
   document.addEventListener("themechange", again);
-  signal?.addEventListener("abort", () => document.removeEventListener("themechange", again));
+  let width = element.clientWidth; // the distance of the camera depends on it
+  const sized = new ResizeObserver(() => {
+    if (element.clientWidth && element.clientWidth !== width) again();
+    width = element.clientWidth;
+  });
+  sized.observe(element);
+  signal?.addEventListener("abort", () => {
+    sized.disconnect();
+    document.removeEventListener("themechange", again);
+  });
   return { draw };
 }
 
@@ -52,6 +61,7 @@ class Arm {
     this.size = Math.max(steps.reduce((all, each) => all + each, 0), ...this.centres.map((each) => Math.hypot(...each)), 0.05);
     this.reach = [[0, 0, 0], [0, 0, 0]];
     this.thick = null;
+    this.eye = null;
   }
 
   /** Return all points of the drawing, with gravity downwards. */
@@ -65,6 +75,7 @@ class Arm {
     for (const point of [...turned.map((each) => each.origin), ...masses]) {
       this.reach = [this.reach[0].map((low, k) => Math.min(low, point[k])), this.reach[1].map((high, k) => Math.max(high, point[k]))];
     }
+    this.eye ??= acrossPlane([[0, 0, 0], ...turned.map((each) => each.origin)]); // it stays while the arm moves
     return { turned, masses };
   }
 
@@ -77,10 +88,10 @@ class Arm {
     const most = Math.max(...balls);
     const open = (joint) => this.bodies[joint].undetermined?.includes("mass");
     return [
-      path(links, { name: "links", line: { color: css("muted"), width: 7 }, hoverinfo: "skip" }),
-      path(arms, { name: "to the masses", line: { color: css("line-strong"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
+      path(links, { name: "links", line: { color: css("line-strong"), width: 12 }, hoverinfo: "skip" }),
+      path(arms, { name: "to the masses", line: { color: css("muted"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
       ...turned.map(({ origin, axis }, place) => path([add(origin, scaled(axis, -half)), add(origin, scaled(axis, half))], {
-        name: this.names[place], line: { color: jointColour(place), width: order[place] === this.thick ? HIGHLIGHT_PX : 9 }, hovertemplate: `${escapeMarkup(this.names[place])}, ${this.geometry.joints[place].type}<extra></extra>`,
+        name: this.names[place], line: { color: jointColour(order[place]), width: order[place] === this.thick ? HIGHLIGHT_PX : 9 }, hovertemplate: `${escapeMarkup(this.names[place])}, ${this.geometry.joints[place].type}<extra></extra>`,
       })),
       {
         ...points(masses), type: "scatter3d", mode: "markers", name: "masses", showlegend: false,
@@ -96,19 +107,19 @@ class Arm {
     ];
   }
 
-  /** Return the layout. height: px; legend: false hides the joint names and axis labels of a small drawing. */
-  layout({ turned }, height, legend) {
+  /** Return the layout. height: px; ratio: width / height; labels: of the axes. */
+  layout(height, ratio, labels) {
     const span = [0, 1, 2].map((k) => this.reach[1][k] - this.reach[0][k]);
     const room = Math.max(MARGIN * Math.max(...span), AXIS * this.size);
-    const sides = span.map((each) => each + 2 * room), longest = Math.max(...sides);
-    const [x, y, z] = sides.map((each) => each / longest); // true proportions, within the cube that the camera shows
+    const lengths = span.map((each) => each + 2 * room), longest = Math.max(...lengths);
+    const sides = lengths.map((each) => each / longest), [x, y, z] = sides; // true proportions
     const axis = (k) => ({
-      range: [this.reach[0][k] - room, this.reach[1][k] + room], title: { text: legend ? "xyz"[k] + " m" : "" }, showticklabels: legend, color: css("muted"), gridcolor: css("line"),
+      range: [this.reach[0][k] - room, this.reach[1][k] + room], title: { text: labels ? "xyz"[k] + " m" : "" }, showticklabels: labels, color: css("muted"), gridcolor: css("line"),
       zerolinecolor: css("line-strong"), showbackground: false, showspikes: false, nticks: 5,
     });
     return {
-      height, hovermode: "closest", showlegend: legend && turned.length <= 10, legend: { orientation: "h", y: 0, yanchor: "top" }, margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "arm",
-      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: EYE } },
+      height, hovermode: "closest", showlegend: false, margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "arm",
+      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: eyeFor(this.eye, sides, ratio, labels) } },
     };
   }
 

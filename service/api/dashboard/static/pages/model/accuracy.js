@@ -1,67 +1,44 @@
-// Accuracy of a version on a recording: torque and residual with intervals, error by segment, reliability, figures.
+// Accuracy of a version on a recording: verdict, torque and residual with intervals, error by segment, reliability, figures.
 
 import { post } from "../../api.js";
-import { h, replace } from "../../dom.js";
-import { card, loading } from "../../ui.js";
-import { boxes, figures, reliability } from "./figures.js";
-import { noData } from "./choice.js";
-import { verdictCard } from "./coverage.js";
-import { intervalArea, lineWithGaps, column, measurementStd } from "./curves.js";
-import { trainingDataNotes } from "./training_data.js";
-import { jointPlots } from "./joints.js";
+import { Await, Card, useRead } from "../../components.js";
+import { JointVerdicts } from "../../jointverdicts.js";
+import { html } from "../../preact.js";
+import { VerdictNote } from "../../verdicts.js";
+import { NoData } from "./choice.js";
+import { column, intervalArea, lineWithGaps, measurementStd } from "./curves.js";
+import { AllFigures, Boxes, Reliability } from "./figures.js";
+import { JointPlots } from "./joints.js";
+import { TrainingDataNotes } from "./training_data.js";
 
 const POINTS = 1000;
+const VIEWS = { "measured and predicted torque": torque, "residual, measured − predicted": residual };
+const ABOUT = {
+  "measured and predicted torque": "95 % of the measurements should lie in the interval. It includes the uncertainty of the model and the noise of the sensors.",
+  "residual, measured − predicted": "95 % of the residuals should lie in the interval. A residual that stays on one side of zero is a systematic error of the model.",
+};
 
-/** Draw the tab for the selected recording. */
-export async function accuracy(view, state, { signal }) {
-  if (state.dataset === null) {
-    replace(view, noData(state));
-    return;
-  }
-  replace(view, loading("Predicting the recording"));
-  const request = { dataset: state.dataset, version: state.version.version, part: state.part };
-  const fetch = async (start, stop) => {
-    const range = stop === null ? {} : { start, stop };
-    const trace = await post(`${state.where}/trace`, { ...request, ...range, points: POINTS }, signal);
-    return { ...trace, joint_types: state.version.joint_types };
-  };
-  const trace = await fetch(0, null);
-  // draw the plot first: an evaluation predicts up to five times as many rows
-  const evaluated = post(`${state.where}/evaluate`, request, signal);
-  evaluated.catch(() => {}); // awaited below unless drawing fails
-  const along = h("div", {}), table = h("div", {}), all = h("div", {}), spread = h("div", {}), reliable = h("div", {});
-  replace(
-    view,
-    trainingDataNotes(trace),
-    table,
-    card("Measured and predicted torque", along),
-    all,
-    h(
-      "div",
-      { class: "grid wide" },
-      card("Error by segment", spread),
-      card("Reliability", reliable),
-    ),
-  );
-  for (const place of [table, all, spread, reliable]) replace(place, loading("Evaluating"));
-  await jointPlots(along, {
-    first: trace,
-    fetch,
-    signal,
-    views: { "measured and predicted torque": torque, "residual, measured − predicted": residual },
-    about: {
-      "measured and predicted torque":
-        "95 % of the measurements should lie in the interval. It includes the uncertainty of the model and the noise of the sensors.",
-      "residual, measured − predicted":
-        "95 % of the residuals should lie in the interval. A residual that stays on one side of zero is a systematic error of the model.",
-    },
-  });
-  const evaluation = await evaluated;
-  if (signal.aborted) return;
-  replace(table, verdictCard(evaluation));
-  replace(all, figures(evaluation));
-  await boxes(spread, evaluation, signal);
-  await reliability(reliable, evaluation, signal);
+/** The tab for the selected recording. */
+export function Accuracy({ where, version, datasets, dataset, part }) {
+  const request = { dataset: dataset?.id, version: version.version, part };
+  const fetch = (rows, signal) => post(`${where}/trace`, { ...request, ...rows, points: POINTS }, signal);
+  const read = (ask) => useRead(async (signal) => dataset && ask(signal), [where, dataset?.id, version.version, part]);
+  const trace = read((signal) => fetch({}, signal));
+  const evaluation = read((signal) => post(`${where}/evaluate`, request, signal));
+  if (!dataset) return html`<${NoData} version=${version} datasets=${datasets} />`;
+  return html`
+    ${evaluation.value && !evaluation.value.judged && html`<${Card} title="Verdict on this recording"><${VerdictNote} verdict=${evaluation.value.verdict} /><${JointVerdicts} verdict=${evaluation.value.verdict} /><//>`}
+    <${Await} reading=${trace} what="Predicting the recording">${(first) => html`
+      <${TrainingDataNotes} trace=${first} />
+      <${Card} title="Measured and predicted torque"><${JointPlots} first=${first} fetch=${fetch} views=${VIEWS} about=${ABOUT} types=${version.joint_types} /><//>`}
+    <//>
+    <${Await} reading=${evaluation} what="Evaluating">${(found) => html`
+      <div class="grid wide">
+        <${Card} title="Reliability"><${Reliability} evaluation=${found} /><//>
+        <${Card} title="Error by segment"><${Boxes} evaluation=${found} /><//>
+      </div>
+      <${AllFigures} evaluation=${found} />`}
+    <//>`;
 }
 
 function torque(trace, joint, x) {

@@ -1,103 +1,68 @@
-// Learnt arm of a version: a 3-D drawing with an adjustable posture, and tables.
+// Learnt arm of a version: a 3-D drawing with an adjustable posture, and tables of its parameters.
 
-import { h, replace } from "../../dom.js";
-import { number } from "../../format.js";
-import { button, card, empty } from "../../ui.js";
+import { Button, Card, Drawn } from "../../components.js";
+import { number, shortNames } from "../../format.js";
+import { Joint, JointKey } from "../../jointbars.js";
+import { latest } from "../../latest.js";
+import { html, useMemo, useRef, useState } from "../../preact.js";
 import { AMBIGUITY_NOTE, drawable, drawing, LEGEND } from "../arm/drawing.js";
-import { midRange } from "../arm/kinematics.js";
-import { jointTable, massTable } from "../arm/tables.js";
+import { AxisTable, ParameterTable } from "../arm/tables.js";
+import { Dial, middle } from "./dial.js";
 import { saveC, saveUrdf } from "./export.js";
 
-const STEPS = 200;
 const DEGREES = 180 / Math.PI;
+const WIDE = 500; // px
 
-/** Draw the tab. */
-export async function arm(view, { name, version }, { signal }) {
-  const { parameters } = version;
-  if (!parameters.inertia) {
-    replace(view, empty("This version has no arm: its estimator does not learn rigid bodies. Train a version with the estimator rigid-body."));
-    return;
-  }
-  const place = h("div", {}), start = midRange(version.training_range);
-  const figure = drawable() ? place : h("p", { class: "hint" }, "3-D drawing is not available: WebGL is off in this browser. The tables contain the same values.");
-  const posture = h("div", {});
-  replace(
-    view,
-    card(
-      "Learnt arm",
-      figure,
-      h("p", { class: "hint" }, `${AMBIGUITY_NOTE} ${LEGEND}${orientationNote(parameters.geometry.gravity)}`),
-      posture,
-      h(
-        "div",
-        { class: "actions" },
-        button("Save as URDF", () => saveUrdf(name, version.version)),
-        version.estimator === "rigid-body" ? button("Save as C", () => saveC(name, version.version)) : null,
-      ),
-    ),
-    card("Parameters", jointTable(version), massTable(version), h("p", { class: "hint" }, `Masses are the physically consistent ones nearest to the estimate${deviationNote(parameters.inertia)}. Values as trained, without online learning.`)),
-  );
-  if (figure !== place) return;
-  const { draw } = await drawing(place, version, start, { signal });
-  replace(posture, sliders(version, start, skipStale(draw)));
+/** The tab. */
+export function Arm({ model: { name }, version }) {
+  const { inertia, geometry } = version.parameters;
+  return html`
+    ${inertia
+      ? html`<${Card} title="Learnt arm">
+          ${drawable() ? html`<${Figure} version=${version} />` : html`<p class="hint">3-D drawing is not available: WebGL is off in this browser. The tables contain the same values.</p>`}
+          <details class="hint"><summary>How to read this</summary><p>${LEGEND}${orientationNote(geometry.gravity)} ${AMBIGUITY_NOTE}</p></details>
+          <div class="actions">
+            <${Button} onclick=${() => saveUrdf(name, version.version)}>Save as URDF<//>
+            ${version.estimator === "rigid-body" && html`<${Button} onclick=${() => saveC(name, version.version)}>Save as C<//>`}
+          </div>
+        <//>`
+      : html`<p class="empty">This version has no arm: its estimator does not learn rigid bodies. Train a version with the estimator rigid-body.</p>`}
+    <${Card} title=${inertia ? "Masses and friction" : "Friction"}><${ParameterTable} version=${version} /><p class="hint">${inertia && massNote(inertia)}${FRICTION_NOTE}</p><//>
+    ${inertia && html`<${Card} title="Axes and centres of mass"><${AxisTable} version=${version} /><//>`}`;
 }
 
-/** Create a slider for each joint within its training range. move(q) is called with all positions. */
-function sliders({ joint_names: names, joint_types: types, training_range: { q: range } }, start, move) {
-  const q = [...start];
-  const text = (joint) => (types[joint] === "prismatic" ? `${q[joint].toFixed(3)} m` : `${(q[joint] * DEGREES).toFixed(1)}°`);
-  const made = names.map((name, joint) => {
-    const [low, high] = [range.min[joint], range.max[joint]];
-    const shown = h("output", { class: "muted" }, text(joint));
-    const input = h("input", { type: "range", min: low, max: high, step: (high - low) / STEPS || "any", value: q[joint], "aria-label": `Position of ${name}` });
-    const update = () => {
-      input.setAttribute("aria-valuetext", text(joint));
-      shown.textContent = text(joint);
-    };
-    input.addEventListener("input", () => {
-      q[joint] = Number(input.value);
-      update();
-      move([...q]);
-    });
-    update();
-    const back = () => {
-      q[joint] = start[joint];
-      input.value = String(start[joint]);
-      update();
-    };
-    return { back, element: h("div", { class: "field" }, h("span", { "aria-hidden": "true" }, `${name} `, shown), input) };
-  });
-  const back = button("Reset posture", () => {
-    made.forEach((each) => each.back());
-    move([...q]);
-  });
-  return h("details", {}, h("summary", {}, "Change posture"), h("div", { class: "grid" }, made.map((each) => each.element)), back);
-}
+const FRICTION_NOTE = "Friction is viscous · dq + Coulomb · sign(dq) + offset; the offset includes every other constant torque. Grey values are within two standard deviations of zero. Values as trained, without online learning.";
 
-/** Return a function that runs `work` one call at a time and skips all waiting calls but the last. */
-function skipStale(work) {
-  let [busy, next] = [false, null];
-  return async (value) => {
-    next = value;
-    if (busy) return;
-    busy = true;
-    try {
-      while (next !== null) {
-        const now = next;
-        next = null;
-        await work(now);
-      }
-    } finally {
-      busy = false;
-    }
+function Figure({ version }) {
+  const { joint_names: names, joint_types: types, training_range: { q: range } } = version;
+  const short = shortNames(names);
+  const start = useMemo(() => range.min.map((low, joint) => middle(low, range.max[joint])), []);
+  const [q, setQ] = useState(start), made = useRef(null);
+  const show = useMemo(() => latest(async (positions) => made.current && (await made.current.draw(positions))), []);
+  const move = (positions) => {
+    setQ(positions);
+    show(positions);
   };
+  const draw = async (place, signal) => {
+    made.current = await drawing(place, version, start, { height: place.clientWidth > WIDE ? 520 : 420, signal });
+  };
+  const dial = (name, joint) => {
+    const scale = types[joint] === "prismatic" ? 1 : DEGREES, round = (value) => Number((scale * value).toFixed(scale === 1 ? 3 : 1));
+    return html`<${Dial} key=${name} name=${`Position of ${name}`} label=${html`<${Joint} index=${joint} name=${short[joint]} />`} unit=${scale === 1 ? "m" : "°"}
+      low=${round(range.min[joint])} high=${round(range.max[joint])} value=${round(q[joint])} onchange=${(value) => move(q.with(joint, value / scale))} />`;
+  };
+  return html`<div class="arm-stage">
+    <div><${Drawn} draw=${draw} inputs=${[version]} kind="arm" /><${JointKey} names=${short} /></div>
+    <div class="dials"><h3>Posture</h3>${names.map(dial)}<${Button} onclick=${() => move(start)}>Reset posture<//></div>
+  </div>`;
 }
 
-function deviationNote({ plausible_deviation: deviation }) {
-  return deviation?.some(Boolean) ? `; their torque differs by up to ${number(Math.max(...deviation), 2)} N·m (RMS, worst joint)` : "";
+function massNote({ mean_is_plausible: plausible, plausible_deviation: deviation }) {
+  const differs = deviation?.some(Boolean) ? `; their torque differs by up to ${number(Math.max(...deviation), 2)} N·m (RMS, worst joint)` : "";
+  return `${plausible ? "The masses are physically consistent" : `The masses are the physically consistent ones nearest to the estimate${differs}`}. Torque depends on sums of masses, rarely on a single one: unidentifiable ones come from the prior. `;
 }
 
 function orientationNote(gravity) {
   if (!Math.hypot(...gravity)) return " The torque does not include gravity, so the orientation of the base is unknown.";
-  return Math.hypot(gravity[0], gravity[1]) > 1e-6 || gravity[2] > 0 ? " It is rotated so that gravity points downwards." : "";
+  return Math.hypot(gravity[0], gravity[1]) > 1e-6 || gravity[2] > 0 ? " The arm is rotated so that gravity points downwards." : "";
 }

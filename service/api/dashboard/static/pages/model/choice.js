@@ -1,8 +1,8 @@
 // Selects for the version, the recording and its part.
 
-import { refresh } from "../../dom.js";
+import { Choice, Empty, Link } from "../../components.js";
 import { count } from "../../format.js";
-import { empty, field, link, select, updateSelect } from "../../ui.js";
+import { html } from "../../preact.js";
 
 const PARTS = [["held_out", "held-out part"], ["all", "whole recording"]];
 
@@ -24,45 +24,37 @@ export function trainingRole(version, dataset) {
   return version.lineage.datasets?.some(same) ? "trained on" : "";
 }
 
-/** Return the initial data set and part: from the address, else held out, else not used in training; the newest first. */
-export function firstChoice(version, datasets, query) {
+/** Return the data set and part to show: the wanted ones, else held out, else not used in training; the newest first. */
+export function chooseData(version, datasets, wanted) {
   const offered = compatible(version, datasets);
-  const requested = offered.find((each) => each.id === query.get("dataset"));
   const by = (...kinds) => offered.find((each) => kinds.includes(trainingRole(version, each)));
-  const dataset = requested ?? by("held out", "partly held out") ?? by("") ?? offered[0] ?? null;
-  if (dataset === null) return { dataset: null, part: "all" };
-  const has = trainingRole(version, dataset).endsWith("held out");
-  const part = has && query.get("part") !== "all" ? "held_out" : "all";
-  return { dataset: dataset.id, part };
+  const dataset = offered.find((each) => each.id === wanted.dataset) ?? by("held out", "partly held out") ?? by("") ?? offered[0] ?? null;
+  if (dataset === null) return { dataset, part: "all" };
+  return { dataset, part: hasPart(version, dataset) && wanted.part !== "all" ? "held_out" : "all" };
 }
 
-/**
- * Create the selects above the tabs. changed(): called after a change of the data set or part; chosen(number): after a
- * change of the version. Returns a function that shows the selects which a tab needs, and updates them.
- */
-export function chooser(place, state, changed, chosen) {
-  const versions = select([], null, (value) => chosen(Number(value)));
-  const recordings = select([], null, (id) => {
-    state.dataset = id;
-    Object.assign(state, firstChoice(state.version, state.datasets, new URLSearchParams({ dataset: id })));
-    changed();
-  });
-  const parts = select(PARTS, state.part, (part) => {
-    state.part = part;
-    changed();
-  });
-  const fields = { version: field("Version", versions), data: field("Recording", recordings), part: field("Part", parts) };
-  return (needs) => {
-    const { model, version, datasets } = state;
-    const offered = compatible(version, datasets);
-    const dataset = offered.find((each) => each.id === state.dataset);
-    const data = needs.data && offered.length > 0;
-    const part = data && dataset && trainingRole(version, dataset).endsWith("held out");
-    updateSelect(versions, versionOptions(model), String(version.version));
-    updateSelect(recordings, offered.map((each) => [each.id, datasetLabel(version, each)]), state.dataset);
-    updateSelect(parts, PARTS, state.part);
-    refresh(place, needs.version ? fields.version : null, data ? fields.data : null, part ? fields.part : null);
-  };
+/** The selects that a tab needs. */
+export function Choices({ model, version, datasets, dataset, part, needs, view, setWanted }) {
+  const offered = compatible(version, datasets);
+  const data = needs.includes("data") && dataset !== null;
+  const want = (id, which) => setWanted({ version: version.version, dataset: id, part: which });
+  return html`<div class="grid">
+    ${needs.includes("version") && html`<${Choice} label="Version" options=${versionOptions(model)} value=${String(version.version)} onchange=${(value) => view(Number(value))} />`}
+    ${data && html`<${Choice} label="Recording" options=${offered.map((each) => [each.id, datasetLabel(version, each)])} value=${dataset.id} onchange=${(id) => want(id, null)} />`}
+    ${data && hasPart(version, dataset) && html`<${Choice} label="Part" options=${PARTS} value=${part} onchange=${(which) => want(dataset.id, which)} />`}
+  </div>`;
+}
+
+/** The empty state for a version without a matching data set. */
+export function NoData({ version, datasets }) {
+  const why = datasets.length
+    ? `None of the ${count(datasets.length)} data sets has the joints of this model (${version.joint_names.join(", ")}) and its torque convention (${version.torque_convention}).`
+    : "There are no data sets yet.";
+  return html`<${Empty} text=${`${why} Upload a recording of this robot that the model was not trained on.`}><${Link} to="#/data" kind="primary">Upload a recording<//><//>`;
+}
+
+function hasPart(version, dataset) {
+  return trainingRole(version, dataset).endsWith("held out");
 }
 
 function versionOptions(model) {
@@ -75,16 +67,4 @@ function versionOptions(model) {
 function datasetLabel(version, dataset) {
   const known = trainingRole(version, dataset);
   return `${dataset.name || dataset.id} – ${count(dataset.report.rows)} samples${known ? `, ${known}` : ", not used in training"}`;
-}
-
-/** Return the empty state for a version without a matching data set. */
-export function noData({ version, datasets }) {
-  const joints = version.joint_names.join(", ");
-  const why = datasets.length
-    ? `None of the ${count(datasets.length)} data sets has the joints of this model (${joints}) and its torque convention (${version.torque_convention}).`
-    : "There are no data sets yet.";
-  return empty(
-    `${why} Upload a recording of this robot that the model was not trained on.`,
-    link("Upload a recording", "#/data", "primary"),
-  );
 }

@@ -1,7 +1,6 @@
 // Downloads of a version: archive, C code, URDF. They are fetched with the API key and saved as files.
 
 import { ApiError } from "../../api.js";
-import { h } from "../../dom.js";
 import { key } from "../../keys.js";
 
 /** Save a version's archive. */
@@ -28,6 +27,6 @@ async function save(name, version, what, ending, more = "") {
   }
   const address = URL.createObjectURL(await answer.blob());
   const file = /filename="?([^";]+)"?/.exec(answer.headers.get("content-disposition") ?? "")?.[1];
-  h("a", { href: address, download: file ?? `${name}-v${version}.${ending}` }).click();
+  Object.assign(document.createElement("a"), { href: address, download: file ?? `${name}-v${version}.${ending}` }).click();
   setTimeout(() => URL.revokeObjectURL(address), 60_000);
 }

@@ -1,30 +1,29 @@
 // Lineage of a version: data, held-out part, options, fit, software.
 
-import { h, replace } from "../../dom.js";
+import { Badge, Card, Facts, Link, Table } from "../../components.js";
 import { bytes, count, number, percent, scientific, seconds, shortNames, when } from "../../format.js";
-import { badge, card, facts, link, table } from "../../ui.js";
+import { Joint } from "../../jointbars.js";
+import { html } from "../../preact.js";
+import { LearningCurveCard, SelectionCard } from "../../training.js";
 import { heldOut, HELD_OUT_NOTE } from "../job/words.js";
-import { learningCurveCard } from "./learning_curve.js";
-import { selectionCard } from "./selection.js";
 
-/** Draw the tab. */
-export async function lineage(view, { version, datasets }) {
-  const from = version.lineage;
-  replace(
-    view,
-    card(`Version ${version.version}`, facts(origin(version))),
-    selectionCard(version),
-    learningCurveCard(version),
-    dataCard(from, datasets),
-    figuresCard(version, from),
-    card("Fit", facts(fit(version)), version.fit.converged === false ? h("p", { class: "banner" }, "The fit did not converge. More iterations may improve the model.") : null),
-    rangeCard(version),
-    card(
-      "Options and software",
-      facts(Object.entries({ ...version.options, ...from.software }).map(([name, value]) => [name.replaceAll("_", " "), String(value).replace(/^([0-9a-f]{12})[0-9a-f]{28}/, "$1")])), // shorten commits
-    ),
-    h("details", {}, h("summary", {}, "Lineage as JSON"), h("pre", { tabindex: "0" }, h("code", {}, JSON.stringify({ lineage: from, fit: version.fit, compact: version.compact, calibration: version.calibration, robot: version.robot && { ...version.robot, urdf: undefined } }, null, 2)))),
-  );
+/** The tab. */
+export function Lineage({ version, datasets }) {
+  const { lineage: from, fit, compact, calibration, robot } = version;
+  const options = Object.entries({ ...version.options, ...from.software }).map(([name, value]) => [name.replaceAll("_", " "), String(value).replace(/^([0-9a-f]{12})[0-9a-f]{28}/, "$1")]); // shorten commits
+  return html`
+    <${Card} title=${`Version ${version.version}`}><${Facts} pairs=${origin(version)} /><//>
+    <${SelectionCard} version=${version} />
+    <${LearningCurveCard} version=${version} />
+    <${TrainedOn} from=${from} datasets=${datasets} />
+    <${Figures} version=${version} />
+    <${Card} title="Fit">
+      <${Facts} pairs=${fitFacts(version)} />
+      ${fit.converged === false && html`<p class="banner">The fit did not converge. More iterations may improve the model.</p>`}
+    <//>
+    <${Range} version=${version} />
+    <${Card} title="Options and software"><${Facts} pairs=${options} /><//>
+    <details><summary>Lineage as JSON</summary><pre tabindex="0"><code>${JSON.stringify({ lineage: from, fit, compact, calibration, robot: robot && { ...robot, urdf: undefined } }, null, 2)}</code></pre></details>`;
 }
 
 function origin(version) {
@@ -32,7 +31,7 @@ function origin(version) {
   const found = [
     ["Model", version.model],
     ["Created", when(version.created_at)],
-    ["Source", version.job ? link("a training job", `#/jobs/${version.job}`) : from.imported ? "import" : "shipped with LIPServe"],
+    ["Source", version.job ? html`<${Link} to=${`#/jobs/${version.job}`}>a training job<//>` : from.imported ? "import" : "shipped with LIPServe"],
     ["Estimator", version.estimator],
     ["Joints", version.joint_names.length < 3 ? version.joint_names.join(", ") : `${version.joint_names.length}, ${version.joint_names[0]} to ${version.joint_names.at(-1)}`],
     ["Torque", version.torque_convention.replace("_", " ")],
@@ -46,24 +45,25 @@ function origin(version) {
   return found;
 }
 
-function dataCard(from, datasets) {
+function TrainedOn({ from, datasets }) {
   if (!from.datasets?.length) {
     const source = from.simulation ? "Simulated motion, trained on another machine." : from.imported ? "Imported. The archive names no data set." : "No data set is recorded.";
-    return card("Trained on", h("p", {}, source));
+    return html`<${Card} title="Trained on"><p>${source}</p><//>`;
   }
   const known = new Set(datasets.map((each) => each.id));
   const held = (row) => from.holdout?.datasets.find((each) => each.id === row.id);
   const columns = [
-    { label: "Data set", cell: (row) => (known.has(row.id) ? link(row.name || row.id, `#/data/${row.id}`) : `${row.name || row.id} (deleted)`) },
+    { label: "Data set", cell: (row) => (known.has(row.id) ? html`<${Link} to=${`#/data/${row.id}`}>${row.name || row.id}<//>` : `${row.name || row.id} (deleted)`) },
     { label: "Samples", numeric: true, cell: (row) => count(row.rows) },
     { label: "Held out", numeric: true, cell: (row) => (held(row) ? `${count(held(row).rows)}${held(row).whole ? " (all)" : ""}` : "–") },
     { label: "Guard (unused)", numeric: true, cell: (row) => (held(row) ? count(held(row).guarded) : "–") },
-    { label: "SHA-256", cell: (row) => h("code", { title: row.sha256 }, row.sha256?.slice(0, 12) ?? "–") },
+    { label: "SHA-256", cell: (row) => html`<code title=${row.sha256}>${row.sha256?.slice(0, 12) ?? "–"}</code>` },
   ];
-  return card("Trained on", table(columns, from.datasets));
+  return html`<${Card} title="Trained on"><${Table} columns=${columns} rows=${from.datasets} /><//>`;
 }
 
-function figuresCard(version, from) {
+function Figures({ version }) {
+  const from = version.lineage;
   const sets = [
     ["Held out", from.holdout?.nmse ? from.holdout : null],
     ["Training data", from.training_metrics],
@@ -71,7 +71,7 @@ function figuresCard(version, from) {
   if (!sets.length) return null;
   const short = shortNames(version.joint_names);
   const columns = [
-    { label: "Joint", cell: (joint) => short[joint] },
+    { label: "Joint", cell: (joint) => html`<${Joint} index=${joint} name=${short[joint]} />` },
     ...sets.flatMap(([label, figures]) => [
       { label: `${label}: nMSE`, numeric: true, cell: (joint) => scientific(figures.nmse[joint]) },
       { label: "RMSE, N·m", numeric: true, cell: (joint) => number(figures.rmse[joint]) },
@@ -79,19 +79,16 @@ function figuresCard(version, from) {
     ]),
   ];
   const caption = sets.map(([label, figures]) => `${label.toLowerCase()}: ${count(figures.samples)} of ${count(figures.of)} samples`).join("; ");
-  return card(
-    "Accuracy after training",
-    table(columns, version.joint_names.map((_name, joint) => joint), { caption }),
-    from.holdout ? h("p", { class: "hint" }, `Held out: ${heldOut(from.holdout.split)}. ${from.holdout.learnt ? HELD_OUT_NOTE : ""}`) : h("p", { class: "hint" }, "Nothing was held out. Evaluate the version on a recording that it was not trained on."),
-  );
+  const note = from.holdout ? `Held out: ${heldOut(from.holdout.split)}. ${from.holdout.learnt ? HELD_OUT_NOTE : ""}` : "Nothing was held out. Evaluate the version on a recording that it was not trained on.";
+  return html`<${Card} title="Accuracy after training"><${Table} columns=${columns} rows=${short.map((_name, joint) => joint)} caption=${caption} /><p class="hint">${note}</p><//>`;
 }
 
 /** Labels of the fit's entries that end with the number of a joint. */
 const OF_JOINTS = { right_angle_: "Probability that the axis is at right angles", local_: "Error after the local correction", widened_: "Intervals widened on held-out data", zero_: "Zero positions, ° (mm)" };
 
-function fit({ fit: report, compact, calibration, conformal, lineage: from }) {
+function fitFacts({ fit: report, compact, calibration, conformal, lineage: from }) {
   const found = [
-    ["Converged", badge(report.converged ? "yes" : "no", report.converged ? "good" : "warn")],
+    ["Converged", html`<${Badge} state=${report.converged ? "yes" : "no"} kind=${report.converged ? "good" : "warn"} />`],
     ["Iterations", count(report.iterations)],
     ["Duration", seconds(report.seconds)],
     ["Samples", count(report.samples_given)],
@@ -116,25 +113,24 @@ function fit({ fit: report, compact, calibration, conformal, lineage: from }) {
       ["Inducing outputs", count(compact.inducing_outputs)],
       ["Max deviation from the exact mean", `${percent(compact.mean_max)} of its std`],
       ["Max deviation from the exact std", percent(compact.std_max)],
-      ["Tolerance reached", badge(compact.tolerance_reached ? "yes" : "no: tau_std is too large", compact.tolerance_reached ? "good" : "warn")],
+      ["Tolerance reached", html`<${Badge} state=${compact.tolerance_reached ? "yes" : "no: tau_std is too large"} kind=${compact.tolerance_reached ? "good" : "warn"} />`],
     );
   }
   if (from.peak_memory_bytes) found.push(["Peak memory", bytes(from.peak_memory_bytes)]);
   return found;
 }
 
-function rangeCard({ joint_names: names, training_range: range }) {
+function Range({ version: { joint_names: names, training_range: range } }) {
   const short = shortNames(names);
   const span = (quantity) => (joint) => `${number(range[quantity].min[joint])} to ${number(range[quantity].max[joint])}`;
   const columns = [
-    { label: "Joint", cell: (joint) => short[joint] },
+    { label: "Joint", cell: (joint) => html`<${Joint} index=${joint} name=${short[joint]} />` },
     { label: "q, rad", numeric: true, cell: span("q") },
     { label: "dq, rad/s", numeric: true, cell: span("dq") },
     { label: "ddq, rad/s²", numeric: true, cell: span("ddq") },
   ];
-  return card(
-    "Training range",
-    table(columns, names.map((_name, joint) => joint), { caption: "Minimum and maximum (prismatic joints: m)" }),
-    h("p", { class: "hint" }, "Outside these ranges the model extrapolates. Its intervals grow, but not always enough."),
-  );
+  return html`<${Card} title="Training range">
+    <${Table} columns=${columns} rows=${names.map((_name, joint) => joint)} caption="Minimum and maximum (prismatic joints: m)" />
+    <p class="hint">Outside these ranges the model extrapolates. Its intervals grow, but not always enough.</p>
+  <//>`;
 }

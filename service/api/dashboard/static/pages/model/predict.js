@@ -1,71 +1,63 @@
-// Form for one prediction: torque of a state, with its interval.
+// Torque of a state that the reader sets with sliders, with its interval and its components.
 
 import { post } from "../../api.js";
-import { h, replace } from "../../dom.js";
-import { number, shortNames } from "../../format.js";
-import { badge, card, errorBox, table } from "../../ui.js";
-import { Z95 } from "./curves.js";
+import { Badge, Button, Card, ErrorBox, Loading } from "../../components.js";
+import { shortNames } from "../../format.js";
+import { Joint } from "../../jointbars.js";
+import { latest } from "../../latest.js";
+import { html, useEffect, useMemo, useState } from "../../preact.js";
+import { Answer } from "./answer.js";
+import { offered } from "./components.js";
+import { Dial, middle } from "./dial.js";
 
-const QUANTITIES = [["q", "q, rad"], ["dq", "dq, rad/s"], ["ddq", "ddq, rad/s²"]];
+const QUANTITIES = [["q", ["rad", "m"]], ["dq", ["rad/s", "m/s"]], ["ddq", ["rad/s²", "m/s²"]]];
 
-/** Draw the tab. */
-export async function predictForm(view, { where, version }, { signal }) {
-  const { joint_names: names, training_range: range } = version;
-  const short = shortNames(names);
-  const middle = (joint) => Number((0.5 * (range.q.min[joint] + range.q.max[joint])).toFixed(3));
-  const inputs = Object.fromEntries(QUANTITIES.map(([quantity]) => [
-    quantity,
-    names.map((name, joint) => h("input", { type: "number", step: "any", required: true, value: String(quantity === "q" ? middle(joint) : 0), "aria-label": `${quantity} of ${name}`, style: "min-width: 4.6rem" })),
-  ]));
-  const answer = h("div", { "aria-live": "polite" });
-  const submit = async (event) => {
-    event.preventDefault();
-    const motion = Object.fromEntries(QUANTITIES.map(([quantity]) => [quantity, inputs[quantity].map((each) => Number(each.value))]));
+/** The tab. */
+export function Predict({ where, version }) {
+  const rest = useMemo(() => atRest(version), []);
+  const [motion, setMotion] = useState(rest), [answer, setAnswer] = useState(null), [error, setError] = useState(null);
+  const stop = useMemo(() => new AbortController(), []);
+  const ask = useMemo(() => latest(async (asked) => {
     try {
-      const found = await post(`${where}/predict`, { ...motion, version: version.version }, signal);
-      replace(answer, shown(found, motion, version));
-    } catch (error) {
-      if (error.name !== "AbortError") replace(answer, errorBox(error));
+      const found = await post(`${where}/predict`, { ...asked, version: version.version, components: offered(version) }, stop.signal);
+      setAnswer({ found, asked });
+      setError(null);
+    } catch (failure) {
+      if (!stop.signal.aborted) setError(failure);
     }
-  };
-  const columns = [
-    { label: "Joint", cell: (joint) => short[joint] },
-    ...QUANTITIES.map(([quantity, label]) => ({ label, cell: (joint) => inputs[quantity][joint] })),
-  ];
-  replace(
-    view,
-    card(
-      "Predict a torque",
-      h("form", { onsubmit: submit }, table(columns, names.map((_name, joint) => joint), { caption: "State in SI units (prismatic joints: m). Initial values: at rest, in the middle of the training range." }), h("button", { type: "submit", class: "primary" }, "Predict")),
-      answer,
-    ),
-  );
+  }), []);
+  useEffect(() => () => stop.abort(), []);
+  useEffect(() => void ask(motion), [motion]);
+  return html`
+    <${Card} title="State" kind="state">
+      <p class="hint">Sliders end at the training range; a number may lie outside. <${Button} onclick=${() => setMotion(rest)}>At rest, middle of the range<//></p>
+      <${Dials} version=${version} motion=${motion} onchange=${setMotion} />
+    <//>
+    <${Card} title="Predicted torque">
+      ${error && html`<${ErrorBox} error=${error} />`}
+      ${answer ? html`<${Answer} ...${answer} version=${version} outside=${outside(version, answer.asked)} />` : !error && html`<${Loading} what="Predicting" />`}
+    <//>`;
 }
 
-/** Format a number with the decimals of the two leading digits of its standard deviation. */
-function fixed(value, std) {
-  const decimals = std > 0 ? Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(std)))) : 4;
-  return value.toFixed(decimals);
+function Dials({ version, motion, onchange }) {
+  const { joint_names: names, joint_types: types, training_range: range } = version;
+  const short = shortNames(names), beyond = outside(version, motion);
+  const dial = (joint) => ([quantity, units]) => html`<${Dial} key=${quantity} name=${`${quantity} of ${names[joint]}`} label=${quantity} unit=${units[types[joint] === "prismatic" ? 1 : 0]}
+    low=${range[quantity].min[joint]} high=${range[quantity].max[joint]} value=${motion[quantity][joint]}
+    onchange=${(value) => onchange({ ...motion, [quantity]: motion[quantity].with(joint, value) })} />`;
+  return html`<ul class="states">${names.map((name, joint) => html`<li key=${name}>
+    <span><${Joint} index=${joint} name=${short[joint]} /> ${beyond[joint].length > 0 && html`<${Badge} state=${`${beyond[joint].join(", ")} outside`} kind="warn" />`}</span>
+    ${QUANTITIES.map(dial(joint))}
+  </li>`)}</ul>`;
 }
 
-function shown(found, motion, { training_range: range }) {
-  const short = shortNames(found.joint_names);
-  const total = found.tau_std.map((each, joint) => found.scale[joint] * Math.hypot(each, found.noise_std[joint]));
-  const outside = (joint) => QUANTITIES.map(([quantity]) => quantity).filter((quantity) => motion[quantity][joint] < range[quantity].min[joint] || motion[quantity][joint] > range[quantity].max[joint]);
-  const beyond = found.joint_names.some((_name, joint) => outside(joint).length);
-  const numeric = (label, cell) => ({ label, numeric: true, cell });
-  const columns = [
-    { label: "Joint", cell: (joint) => short[joint] },
-    numeric("tau, N·m", (joint) => fixed(found.tau[joint], found.tau_std[joint])),
-    numeric("tau_std", (joint) => number(found.tau_std[joint], 2)),
-    numeric("noise_std", (joint) => number(found.noise_std[joint], 2)),
-    numeric("95 % interval of measurements", (joint) => `${fixed(found.tau[joint], total[joint])} ± ${fixed(Z95 * total[joint], total[joint])}`),
-    { label: "Training range", cell: (joint) => (outside(joint).length ? badge(`${outside(joint).join(", ")} outside`, "warn") : badge("within", "good")) },
-  ];
-  const revision = found.revision ? `, revision ${found.revision}` : "";
-  return [
-    beyond ? h("div", { class: "banner", role: "note" }, "This state is partly outside the training range. The version extrapolates: its interval grows, but not always enough. Do not send this torque to a robot without a check.") : null,
-    table(columns, found.joint_names.map((_name, joint) => joint), { caption: `Version ${found.version}${revision} of ${found.model}, ${found.torque_convention.replace("_", " ")}` }),
-    h("p", { class: "hint" }, "“Within” refers to each value alone, not to their combination."),
-  ];
+/** Return the state at rest in the middle of the training range. */
+function atRest({ joint_names: names, training_range: { q } }) {
+  const zero = names.map(() => 0);
+  return { q: names.map((_name, joint) => middle(q.min[joint], q.max[joint])), dq: zero, ddq: zero };
+}
+
+/** Return the quantities of each joint that are outside the training range. */
+function outside({ joint_names: names, training_range: range }, motion) {
+  return names.map((_name, joint) => QUANTITIES.map(([quantity]) => quantity).filter((quantity) => motion[quantity][joint] < range[quantity].min[joint] || motion[quantity][joint] > range[quantity].max[joint]));
 }

@@ -1,124 +1,96 @@
 // Versions and aliases: serve, roll back, export, delete, compare.
 
-import { del, get, path, post } from "../../api.js";
-import { h, replace } from "../../dom.js";
+import { del, path, post } from "../../api.js";
+import { Badge, Button, Card, Choice, Field, Listing, Table } from "../../components.js";
 import { ago, when } from "../../format.js";
-import { listing } from "../../tables.js";
-import { badge, button, card, confirm, field, loading, notice, select, table } from "../../ui.js";
-import { QUALITY_HINT, qualityColumns } from "../quality.js";
-import { compareForm } from "./compare.js";
+import { html, useRef, useState } from "../../preact.js";
+import { confirm } from "../../ui.js";
+import { VERDICT_HINT, verdictColumns } from "../../verdicts.js";
+import { Compare } from "./compare.js";
 import { exportVersion } from "./export.js";
 import { moveAlias, servingButton } from "./serving.js";
 
-/** Draw the tab. */
-export async function versions(view, state, { signal, reload, select: viewVersion }) {
-  replace(view, loading());
-  const { items: aliases } = await get(`${state.where}/aliases`, {}, signal);
-  replace(
-    view,
-    card("Versions", versionTable(state, aliases, reload, viewVersion)),
-    card("Aliases", aliasTable(state, aliases, reload), aliasForm(state, reload)),
-    state.model.versions.length > 1 ? card("Compare versions", compareForm(state, signal)) : null,
-  );
+/** The tab. */
+export function Versions(state) {
+  return html`
+    <${Card} title="Versions"><${List} ...${state} /><p class="hint">${VERDICT_HINT}</p><//>
+    <${Card} title="Aliases"><${Aliases} ...${state} /><${AliasForm} ...${state} /><//>
+    ${state.model.versions.length > 1 && html`<${Card} title="Compare versions"><${Compare} ...${state} /><//>`}`;
 }
 
-function versionTable({ name, where, model, version }, aliases, reload, viewVersion) {
-  const serving = model.serving_version;
+function List({ model, where, aliases, version, view, changed }) {
+  const { name, serving_version: serving } = model;
   const named = (number) => aliases.filter((each) => each.version === number && each.alias !== "serving").map((each) => each.alias);
-  const actions = (each) => {
-    const number = each.version;
-    const made = [button("View", () => viewVersion(number, "accuracy"))];
-    if (number !== serving) made.push(button(each.verdict.serves ? "Serve" : "Serve anyway", async () => {
-      if (await moveAlias({ name, where, model }, "serving", each)) await reloadAndNotify(reload, `Version ${number} of ${name} is now serving.`);
-    }, { kind: servingButton(each)[1] }));
-    made.push(button("Export", () => exportVersion(name, number)));
-    if (number !== serving && !named(number).length) made.push(button("Delete", async () => {
-      if (!(await confirm(`Delete version ${number} of ${name}? This cannot be undone.`, `Delete version ${number}`))) return;
-      await del(`${where}/versions/${number}`);
-      await reloadAndNotify(reload, `Version ${number} deleted.`);
-    }, { kind: "danger" }));
-    for (const press of made) press.setAttribute("aria-label", `${press.textContent}: version ${number}`);
-    return h("div", { class: "actions" }, made);
+  const serve = async (each) => {
+    if (await moveAlias({ name, where, model }, "serving", each)) changed(`Version ${each.version} of ${name} is now serving.`);
   };
+  const remove = async (number) => {
+    if (!(await confirm(`Delete version ${number} of ${name}? This cannot be undone.`, `Delete version ${number}`))) return;
+    await del(`${where}/versions/${number}`);
+    changed(`Version ${number} deleted.`);
+  };
+  const action = (number, text, onclick, kind = "") => html`<${Button} key=${text} kind=${kind} label=${`${text}: version ${number}`} onclick=${onclick}>${text}<//>`;
+  const actions = (each) => {
+    const number = each.version, away = number !== serving;
+    return html`<div class="actions">
+      ${action(number, "View", () => view(number, "accuracy"))}
+      ${away && action(number, each.verdict.serves ? "Serve" : "Serve anyway", () => serve(each), servingButton(each)[1])}
+      ${action(number, "Export", () => exportVersion(name, number))}
+      ${away && !named(number).length && action(number, "Delete", () => remove(number), "danger")}
+    </div>`;
+  };
+  const label = ({ version: number }) => html`${number} ${number === serving && html`<${Badge} state="serving" /> `}${named(number).map((alias) => html`<${Badge} state=${alias} kind="plain" /> `)}${number === version.version && html`<span class="muted">viewing</span>`}`;
   const columns = [
-    {
-      label: "Version",
-      value: (each) => each.version,
-      first: "descending",
-      cell: (each) => [
-        `${each.version} `,
-        each.version === serving ? badge("serving") : null,
-        " ",
-        named(each.version).map((alias) => [badge(alias, "plain"), " "]),
-        each.version === version.version ? h("span", { class: "muted" }, "viewing") : null,
-      ],
-    },
-    ...qualityColumns((each) => each.verdict),
+    { label: "Version", value: (each) => each.version, first: "descending", cell: label },
+    ...verdictColumns((each) => each.verdict),
     { label: "Estimator", value: (each) => each.estimator, cell: (each) => each.estimator },
-    { label: "Created", value: (each) => each.created_at, first: "descending", cell: (each) => h("time", { datetime: each.created_at, title: when(each.created_at) }, ago(each.created_at)) },
+    { label: "Created", value: (each) => each.created_at, first: "descending", cell: (each) => html`<time datetime=${each.created_at} title=${when(each.created_at)}>${ago(each.created_at)}</time>` },
     { label: "Actions", cell: actions },
   ];
-  const list = listing(columns, {
-    caption: "Versions, newest first",
-    what: ["version", "versions"],
-    key: (each) => each.version,
-    words: (each) => [`version ${each.version}`, each.estimator, each.verdict.label, ...named(each.version)].join(" "),
-    minRows: 4,
-  });
-  list.show([...model.versions].reverse());
-  return [list.element, h("p", { class: "hint" }, QUALITY_HINT)];
+  const words = (each) => [`version ${each.version}`, each.estimator, each.verdict.label, ...named(each.version)].join(" ");
+  return html`<${Listing} columns=${columns} rows=${[...model.versions].reverse()} caption="Versions, newest first" what=${["version", "versions"]} identity=${(each) => each.version} words=${words} minRows=${4} />`;
 }
 
-function aliasTable({ name, where }, aliases, reload) {
-  const back = (each) => button("Roll back", async () => {
-    const what = each.alias === "serving" ? `Version ${each.previous} of ${name} will serve instead of version ${each.version}.` : `It will point to version ${each.previous} again.`;
-    if (!(await confirm(`Roll back the alias “${each.alias}”? ${what}`, `Roll back to version ${each.previous}`, "primary"))) return;
-    const now = await post(`${where}/aliases/${encodeURIComponent(each.alias)}/rollback`, {});
-    await reloadAndNotify(reload, `${each.alias} → version ${now.version}`);
-  });
-  const remove = (each) => button("Remove", async () => {
-    if (!(await confirm(`Remove the alias “${each.alias}”? Queries that name it will fail. Version ${each.version} is kept.`, "Remove alias"))) return;
-    await del(path`/v1/models/${name}/aliases/${each.alias}`);
-    await reloadAndNotify(reload, `Alias ${each.alias} removed.`);
-  }, { kind: "danger" });
-  const named = (made, each) => {
-    made.setAttribute("aria-label", `${made.textContent}: ${each.alias}`);
-    return made;
+function Aliases({ model: { name }, where, aliases, changed }) {
+  const back = async ({ alias, version, previous }) => {
+    const what = alias === "serving" ? `Version ${previous} of ${name} will serve instead of version ${version}.` : `It will point to version ${previous} again.`;
+    if (!(await confirm(`Roll back the alias “${alias}”? ${what}`, `Roll back to version ${previous}`, "primary"))) return;
+    const now = await post(`${where}/aliases/${encodeURIComponent(alias)}/rollback`, {});
+    changed(`${alias} → version ${now.version}`);
   };
+  const remove = async ({ alias, version }) => {
+    if (!(await confirm(`Remove the alias “${alias}”? Queries that name it will fail. Version ${version} is kept.`, "Remove alias"))) return;
+    await del(path`/v1/models/${name}/aliases/${alias}`);
+    changed(`Alias ${alias} removed.`);
+  };
+  const actions = (each) => html`<div class="actions">
+    ${each.previous !== null && html`<${Button} label=${`Roll back: ${each.alias}`} onclick=${() => back(each)}>Roll back<//>`}
+    ${each.alias !== "serving" && html`<${Button} kind="danger" label=${`Remove: ${each.alias}`} onclick=${() => remove(each)}>Remove<//>`}
+  </div>`;
   const columns = [
     { label: "Alias", cell: (each) => `${each.alias} → ${each.version}` },
-    {
-      label: "Actions",
-      cell: (each) => h("div", { class: "actions" }, each.previous === null ? null : named(back(each), each), each.alias === "serving" ? null : named(remove(each), each)),
-    },
+    { label: "Actions", cell: actions },
     { label: "Previous", cell: (each) => (each.previous === null ? "–" : `version ${each.previous}`) },
     { label: "Changed", cell: (each) => when(each.changed_at) },
   ];
-  return table(columns, aliases, { caption: "“serving” is used for queries that name no version; other aliases for queries that name them" });
+  return html`<${Table} columns=${columns} rows=${aliases} identity=${(each) => each.alias} caption="“serving” is used for queries that name no version; other aliases for queries that name them" />`;
 }
 
-function aliasForm({ where, model, name }, reload) {
-  const alias = h("input", { type: "text", required: true, pattern: "[a-z][a-z0-9._\\-]{0,63}", placeholder: "production", autocomplete: "off", spellcheck: "false" });
-  const version = select([...model.versions].reverse().map((each) => [String(each.version), `version ${each.version}`]), String(model.serving_version ?? model.latest_version));
-  const set = button("Set alias", async () => {
-    if (!alias.reportValidity()) return;
-    const chosen = alias.value.trim(), number = Number(version.value);
-    if (await moveAlias({ name, where, model }, chosen, model.versions.find((each) => each.version === number))) await reloadAndNotify(reload, `${chosen} → version ${number}`);
-  });
-  return h(
-    "details",
-    {},
-    h("summary", {}, "Create or move an alias"),
-    h("div", { class: "grid" }, field("Alias", alias, "A lower-case letter, then lower-case letters, digits, dots and hyphens."), field("Points to", version)),
-    set,
-  );
-}
-
-/** Reload the page, then show a notice, so that no button of the old state can be pressed. */
-async function reloadAndNotify(reload, text) {
-  try {
-    await reload();
-  } finally {
-    notice(text); // the action succeeded even if the reload failed
-  }
+function AliasForm({ where, model, changed }) {
+  const newest = [...model.versions].reverse();
+  const [alias, setAlias] = useState(""), [number, setNumber] = useState(model.serving_version ?? model.latest_version), form = useRef(null);
+  const set = async () => {
+    if (!form.current.reportValidity()) return;
+    const chosen = alias.trim();
+    if (await moveAlias({ name: model.name, where, model }, chosen, model.versions.find((each) => each.version === number))) changed(`${chosen} → version ${number}`);
+  };
+  const input = (attributes) => html`<input ...${attributes} type="text" required pattern="[a-z][a-z0-9._\\-]{0,63}" placeholder="production" autocomplete="off" spellcheck=${false} value=${alias} onInput=${(event) => setAlias(event.target.value)} />`;
+  return html`<details>
+    <summary>Create or move an alias</summary>
+    <form class="grid" ref=${form} onSubmit=${(event) => event.preventDefault()}>
+      <${Field} label="Alias" hint="A lower-case letter, then lower-case letters, digits, dots and hyphens." input=${input} />
+      <${Choice} label="Points to" options=${newest.map((each) => [String(each.version), `version ${each.version}`])} value=${String(number)} onchange=${(value) => setNumber(Number(value))} />
+    </form>
+    <${Button} onclick=${set}>Set alias<//>
+  </details>`;
 }

@@ -1,0 +1,34 @@
+// A slider with a number input beside it.
+
+import { html, useState } from "../../preact.js";
+
+const STEPS = 200;
+
+/** A slider from low to high, and an input that also takes values outside. name: for screen readers; label: what is visible. */
+export function Dial({ name, label, unit, low, high, value, onchange }) {
+  const [text, setText] = useState("");
+  const typed = text.trim() !== "" && Number(text) === value; // keep "1." and "1e" as they are typed
+  const type = (event) => {
+    setText(event.target.value);
+    if (event.target.value !== "" && Number.isFinite(Number(event.target.value))) onchange(Number(event.target.value));
+  };
+  const slide = (event) => onchange(round(Number(event.target.value), low, high));
+  const steps = (high - low) / STEPS || "any";
+  return html`<div class="dial">
+    <span aria-hidden="true">${label}</span>
+    <input type="range" min=${low} max=${high} step=${steps} value=${value} aria-label=${`${name}, slider`} aria-valuetext=${`${value} ${unit}`} onInput=${slide} />
+    <input type="number" step="any" value=${typed ? text : String(value)} aria-label=${name} onInput=${type} />
+    <span aria-hidden="true" class="muted">${unit}</span>
+  </div>`;
+}
+
+/** Return the middle of a range, rounded. */
+export function middle(low, high) {
+  return round((low + high) / 2, low, high);
+}
+
+/** Round a value to a thousandth of the order of its range, so that it fits into the input. */
+function round(value, low, high) {
+  const decimals = high > low ? 2 - Math.floor(Math.log10(high - low)) : 3;
+  return Number(value.toFixed(Math.min(Math.max(decimals, 0), 6)));
+}
