@@ -190,6 +190,14 @@ def test_long_joint_names_cover_nothing_and_no_value_is_cut(
     assert page.evaluate(CUT) == []
 
 
+def test_code_of_the_lineage_is_not_clipped_on_a_phone(windows: Visit, dashboard: Dashboard, model: str) -> None:
+    page = windows(dashboard.server.url, size=PHONE, touch=True).open(f"#/models/{model}?tab=lineage")
+    page.get_by_text("Lineage as JSON").click()
+    code = page.locator("pre")
+    expect(code).to_contain_text('"lineage"')
+    assert code.evaluate("(each) => each.scrollWidth <= each.clientWidth")
+
+
 def test_warnings_are_chips_that_open_their_text(visitor: Visitor, model: str) -> None:
     texts = ["The fit did not converge. Train with `max_iterations` 500.", "The joints moved together: by 0.5 rad."]
 
