@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from lipserve import StreamClient
 from service.cli.wording import in_shell
 from tests.service.data import error, train, upload
 from tests.service.server import Server
@@ -85,3 +87,17 @@ def test_thresholds_of_a_model_change_its_verdicts(asking, lipserve):
     assert server.client.post(f"/v1/models/{model}/evaluate", json=asked).json()["verdict"]["level"] == "too_uncertain"
     error(server.client.put(f"/v1/models/{model}/aliases/safe", json={"version": 1}), 409, "conflict")
     assert error(server.client.put(f"/v1/models/{model}/thresholds", json={"max_error": 2}), 422, "invalid_request")
+
+
+def test_running_stream_keeps_its_version_after_a_refusal_and_follows_an_override(asking):
+    server, jobs = asking
+    where, number = "/v1/models/good/aliases/serving", jobs["other-robot"]["version"]
+    motion = np.zeros((3, 2))
+    with StreamClient("good", url=server.url) as stream:
+        assert stream.predict(*motion).version == 1
+        error(server.client.put(where, json={"version": number}), 409, "conflict")
+        assert stream.predict(*motion).version == 1
+        assert server.client.put(where, json={"version": number, "override": True}).status_code == 200
+        assert stream.predict(*motion).version == number
+        assert server.client.post(f"{where}/rollback", json={}).json()["version"] == 1
+        assert stream.predict(*motion).version == 1

@@ -1,8 +1,8 @@
 // Router: shows the page that the part of the address after # names.
 
-import { replace } from "./dom.js";
+import { Empty, ErrorBox, Link, Loading } from "./components.js";
 import { forgetKey, key } from "./keys.js";
-import { empty, errorBox, link, loading } from "./ui.js";
+import { html, render } from "./preact.js";
 
 const ROUTES = [
   [/^\/?$/, "overview"],
@@ -27,21 +27,27 @@ async function show() {
   markSection(where);
   setTitle("");
   if (page === null) {
-    replace(main, empty(`Page ${where} does not exist.`, link("Overview", "#/")));
+    put(html`<${Empty} text=${`Page ${where} does not exist.`}><${Link} to="#/">Overview<//><//>`);
     return;
   }
-  const view = document.createElement("div");
-  replace(main, loading());
+  put(html`<${Loading} />`);
   try {
     const module = await import(`./pages/${page}.js`);
     if (signal.aborted) return;
-    replace(main, view);
-    await module.render(view, { ...params, query: new URLSearchParams(query) }, { signal, title: setTitle });
+    await module.render(put(null), { ...params, query: new URLSearchParams(query) }, { signal, title: setTitle });
   } catch (error) {
     if (signal.aborted || error.name === "AbortError") return;
     if (!error.status && error.name !== "ApiError") console.error(error);
-    replace(main, errorBox(error, show));
+    put(html`<${ErrorBox} error=${error} retry=${show} />`);
   }
+}
+
+/** Show content in place of the page; return the element that contains it. */
+function put(content) {
+  const place = document.createElement("div");
+  main.replaceChildren(place);
+  render(content, place);
+  return place;
 }
 
 function findRoute(where) {

@@ -1,6 +1,7 @@
 // The API key: requested when the service requires one, kept until the tab is closed, sent with every request.
 
-import { h } from "./dom.js";
+import { ask } from "./dialogs.js";
+import { html } from "./preact.js";
 
 const STORAGE_KEY = "lipserve-key";
 let pending = null;
@@ -23,43 +24,18 @@ export function forgetKey() {
   sessionStorage.removeItem(STORAGE_KEY);
 }
 
-function dialog(reason) {
-  return new Promise((resolve) => {
-    const input = h("input", {
-      id: "key-input",
-      type: "password",
-      autocomplete: "off",
-      spellcheck: "false",
-      required: true,
-      placeholder: "lip_…",
-      "aria-describedby": "key-reason",
-    });
-    const form = h(
-      "form",
-      { method: "dialog" },
-      h("h2", {}, "API key"),
-      h("p", { id: "key-reason" }, reason || "This service requires an API key."),
-      h("div", { class: "field" }, h("label", { for: "key-input" }, "Key"), input),
-      h("p", { class: "hint" }, "Create one on the service's machine: ", h("code", {}, "lipserve keys create --name me --scope admin")),
-      h("p", { class: "hint" }, "The key is kept until you close this tab."),
-      h(
-        "div",
-        { class: "actions" },
-        h("button", { class: "primary", value: "use" }, "Use key"),
-        h("button", { value: "cancel", formnovalidate: true }, "Cancel"),
-      ),
-    );
-    const box = h("dialog", { "aria-labelledby": "key-title" }, form);
-    form.querySelector("h2").id = "key-title";
-    box.addEventListener("close", () => {
-      const given = box.returnValue === "use" ? input.value.trim() : "";
-      box.remove();
-      if (given) sessionStorage.setItem(STORAGE_KEY, given);
-      document.dispatchEvent(new Event("keychange"));
-      resolve(given !== "");
-    });
-    document.body.append(box);
-    box.showModal();
-    input.focus();
-  });
+async function dialog(reason) {
+  let given = "";
+  const form = html`<form method="dialog">
+    <h2 id="key-title">API key</h2>
+    <p id="key-reason">${reason || "This service requires an API key."}</p>
+    <div class="field"><label for="key-input">Key</label><input id="key-input" type="password" autocomplete="off" spellcheck=${false} required placeholder="lip_…" aria-describedby="key-reason" data-first /></div>
+    <p class="hint">Create one on the service's machine: <code>lipserve keys create --name me --scope admin</code></p>
+    <p class="hint">The key is kept until you close this tab.</p>
+    <div class="actions"><button class="primary" value="use">Use key</button><button value="cancel" formnovalidate>Cancel</button></div>
+  </form>`;
+  const value = await ask(form, { "aria-labelledby": "key-title" }, (box) => (given = box.querySelector("input").value.trim()));
+  if (value === "use" && given) sessionStorage.setItem(STORAGE_KEY, given);
+  document.dispatchEvent(new Event("keychange"));
+  return value === "use" && given !== "";
 }

@@ -1,6 +1,5 @@
 // Plots that share a linear x axis: their cursor, zoom, marks, and a range selected by dragging.
 
-import { h, replace } from "./dom.js";
 import { plotly } from "./plots.js";
 
 const MIN_DRAG_PX = 4; // a shorter drag is a click
@@ -29,8 +28,10 @@ export class LinkedPlots {
   /** Add a plot that has been drawn. */
   add(element) {
     if (this.#plots.has(element)) return;
-    const cursor = h("div", { class: "cursor", hidden: true }), stretch = h("div", { class: "stretch", hidden: true }), marks = h("div", {});
-    const layer = h("div", { class: "linked", "aria-hidden": "true" }, stretch, marks, cursor);
+    const cursor = box("cursor"), stretch = box("stretch"), marks = box(""), layer = box("linked");
+    cursor.hidden = stretch.hidden = true;
+    layer.setAttribute("aria-hidden", "true");
+    layer.append(stretch, marks, cursor);
     const parts = { layer, cursor, stretch, marks };
     this.#plots.set(element, parts);
     element.classList.add("linking");
@@ -87,12 +88,13 @@ export class LinkedPlots {
 
   #drawMarks(element, { marks }) {
     const made = this.#marks.map(({ x, word, kind }) => {
-      const mark = h("div", { class: `mark ${kind}`, "data-word": word });
+      const mark = box(`mark ${kind}`);
+      mark.dataset.word = word;
       placeBetween(mark, element, x, x);
       mark.classList.toggle("late", parseFloat(mark.style.left) > LATE_MARK_PERCENT);
       return mark;
     });
-    replace(marks, made);
+    marks.replaceChildren(...made);
   }
 
   #follow(element, event) {
@@ -163,4 +165,10 @@ function xUnderPointer(element, layer, event, nearest = false) {
   if (!nearest && (!(share >= 0 && share <= 1) || event.clientY < area.top || event.clientY > area.bottom)) return null;
   const [low, high] = element.layout.xaxis.range;
   return low + Math.min(Math.max(share, 0), 1) * (high - low);
+}
+
+function box(kind) {
+  const made = document.createElement("div");
+  made.className = kind;
+  return made;
 }

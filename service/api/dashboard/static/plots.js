@@ -1,7 +1,6 @@
 // Plots by Plotly in the colours of the theme. Each of its two bundles is loaded when it is first needed.
 
 import { css, withOpacity, jointColour } from "./colours.js";
-import { h } from "./dom.js";
 
 const SPATIAL = new Set(["scatter3d", "mesh3d"]);
 const loading = new Map();
@@ -14,7 +13,7 @@ export function plotly(bundle = "cartesian") {
 
 function load(bundle) {
   return new Promise((resolve, reject) => {
-    const script = h("script", { src: `/dashboard/plotly/${bundle}.js` });
+    const script = Object.assign(document.createElement("script"), { src: `/dashboard/plotly/${bundle}.js` });
     script.onload = () => resolve(window.Plotly); // each bundle replaces the other in window.Plotly
     script.onerror = () => {
       loading.delete(bundle);

@@ -123,7 +123,7 @@ function robotHint(picked, usual, chosen) {
 function requestOf({ name, picked, estimator, held, named, more, robot }) {
   const request = { model: name.trim(), datasets: picked.map((each) => each.id), estimator, options: more.options, holdout: holdoutOf(held, named) };
   if (more.promotion) request.promotion = more.promotion;
-  if (robot) request.robot = robot;
+  request.robot = robot || null; // null: none, also if the recordings have one
   if (more.base && usesRobot(estimator)) request.base = more.base;
   const types = more.joint_types.split(",").map((each) => each.trim()).filter(Boolean);
   if (types.length) request.joint_types = types;
