@@ -113,7 +113,7 @@ def test_list_shows_the_worst_finding_of_a_recording(visitor: Visitor, dashboard
     expect(row).to_contain_text(report["remedies"][0]["text"].partition(". ")[0])
     expect(row).to_contain_text(re.compile("[1-9] more"))
     expect(row.get_by_text("warning")).to_be_visible()
-    row.get_by_role("link", name="Read reversed again").click()
+    row.get_by_role("link", name="Read again: reversed").click()
     expect(page.get_by_role("tab", name="Read again", selected=True)).to_be_visible()
     page.get_by_role("button", name="Read again with").first.click()
     expect(page).not_to_have_url(re.compile("tab=again"))

@@ -6,6 +6,7 @@ import { escapeMarkup, plotly } from "./plots.js";
 import { html, useRef } from "./preact.js";
 
 const SCALE = 2; // pixels of the picture per CSS pixel
+const NAME_SIZE = 11; // of the names that the page writes over plots
 const FONT = "system-ui, sans-serif"; // a picture does not inherit the page's font
 
 /**
@@ -52,7 +53,7 @@ async function pictureOf(element) {
 /** Return an image of one plot, with the names that the page writes over it: `layout.meta`, [{text, x, y}]. */
 async function drawing({ data, layout }, width, height) {
   const Plotly = await plotly(data.some(({ type }) => type === "scatter3d" || type === "mesh3d") ? "gl3d" : "cartesian");
-  const over = (layout.meta ?? []).map(({ text, x, y }) => ({ text: escapeMarkup(text), x, y, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom", showarrow: false }));
+  const over = (layout.meta ?? []).map(({ text, x, y }) => ({ text: escapeMarkup(text), x, y, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom", showarrow: false, font: { size: NAME_SIZE } }));
   const figure = { data, layout: { ...layout, annotations: [...(layout.annotations ?? []), ...over], font: { ...layout.font, family: FONT } } };
   const address = await Plotly.toImage(figure, { format: "png", width, height, scale: SCALE });
   const image = new Image();

@@ -16,7 +16,7 @@ const COLUMNS = [
   { label: "Joints", numeric: true, value: (row) => row.joint_names.length, cell: (row) => row.joint_names.length },
   { label: "Robot", value: (row) => row.report.robot, cell: (row) => row.report.robot ?? "–" },
   { label: "Uploaded", value: (row) => row.created_at, first: "descending", cell: (row) => html`<time datetime=${row.created_at} title=${when(row.created_at)}>${ago(row.created_at)}</time>` },
-  { label: "Next", cell: (row) => html`<div class="actions next"><${Link} to=${`#/train?datasets=${row.id}`} label=${`Train on ${row.name}`}>Train<//>${row.report.upload_options && html`<${Link} to=${`#/data/${row.id}?tab=again`} label=${`Read ${row.name} again`}>Read again<//>`}</div>` },
+  { label: "Next", cell: (row) => html`<div class="actions next"><${Link} to=${`#/train?datasets=${row.id}`} label=${`Train on ${row.name}`}>Train<//>${row.report.upload_options && html`<${Link} to=${`#/data/${row.id}?tab=again`} label=${`Read again: ${row.name}`}>Read again<//>`}</div>` },
 ];
 
 /** The page `#/data`. */

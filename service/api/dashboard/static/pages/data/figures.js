@@ -19,11 +19,9 @@ export function ExcitationTab({ report, joints }) {
 /** Identifiability of friction, torque compared with the robot's URDF, noise and saturation. */
 export function FrictionTab({ report, joints }) {
   return html`<${Friction} found=${report.excitation} joints=${joints} />
-    <div class="grid wide">
-      ${report.against_robot && html`<${AgainstRobot} found=${report.against_robot} joints=${joints} />`}
-      <${Noise} report=${report} joints=${joints} />
-      <${Saturation} rows=${report.saturation} joints=${joints} />
-    </div>`;
+    ${report.against_robot && html`<${AgainstRobot} found=${report.against_robot} joints=${joints} />`}
+    <${Noise} report=${report} joints=${joints} />
+    <${Saturation} rows=${report.saturation} joints=${joints} />`;
 }
 
 /** How the columns were read, and every preparation step. */
