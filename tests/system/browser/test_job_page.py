@@ -53,6 +53,7 @@ def test_each_search_has_an_objective_with_its_own_axis(visitor: Visitor, dashbo
     for _, values in (curve for plot in page.evaluate(CURVES) for curve in plot):
         assert values == sorted(values, reverse=True)
     expect(page.get_by_text("Within one plot, lower is a better fit.")).to_be_visible()
+    expect(page.get_by_text("This page was opened during the job")).to_have_count(0)  # nothing is missing
     labels = page.evaluate(TICKS)
     assert sorted(labels) == ["1", "2", "3", "4", "5"]  # whole numbers, none twice
     assert audit(page) == []

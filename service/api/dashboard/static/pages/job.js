@@ -69,7 +69,7 @@ function Course({ job, course }) {
   const active = ACTIVE.has(job.state);
   const rows = [...course.rows];
   return html`<${Card} title="Progress">
-    <p role="status"><${Badge} state=${job.state} /> ${active ? sentence(stage(job)) : job.history.at(-1)?.message}</p>
+    <p role="status"><${Badge} state=${job.state} /> ${active ? stage(job) : job.history.at(-1)?.message}</p>
     ${active && html`<${Progress} fraction=${job.progress.fraction} label="Training progress" /><p class="muted timing">${timing(job)}</p>`}
     ${rows.map(([estimator, row]) => html`<section class="tried" key=${estimator} aria-label=${estimator}>
       <h3>${estimator}</h3>

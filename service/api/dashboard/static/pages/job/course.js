@@ -36,7 +36,7 @@ function courseOf({ id, attempts, progress }) {
   const known = seen.get(id);
   if (known?.attempts === attempts) return known;
   if (!known && seen.size >= MAX_JOBS) seen.delete(seen.keys().next().value);
-  const late = !known && !["waiting", "loading"].includes(progress.stage);
+  const late = !known && (progress.iteration > 0 || !["waiting", "loading", ...SEARCHES].includes(progress.stage));
   seen.set(id, { attempts, current: { estimator: null, stage: "waiting" }, rows: new Map(), late });
   return seen.get(id);
 }
