@@ -162,6 +162,10 @@ def test_sliders_set_the_state_and_the_torque_is_shown_with_its_components(
     bar = page.get_by_role("region", name="Predicted torque").get_by_role("listitem").first.get_by_role("img")
     for name in ("gravity", "friction"):
         expect(bar).to_have_attribute("aria-label", re.compile(f"{name} {found['components'][name]['mean'][0]:.3g}"))
+    for name in ("q", "dq", "ddq"):  # the whole slider is inside the training range
+        for end in ("Home", "End"):
+            page.get_by_role("slider", name=f"{name} of joint2, slider", exact=True).press(end)
+            expect(page.locator(".states .badge")).to_have_count(0)
     page.get_by_role("button", name="At rest, middle of the range").click()
     expect(bar).not_to_have_attribute(
         "aria-label", re.compile(f"gravity {found['components']['gravity']['mean'][0]:.3g}")

@@ -13,10 +13,10 @@ export function Dial({ name, label, unit, low, high, value, onchange }) {
     if (event.target.value !== "" && Number.isFinite(Number(event.target.value))) onchange(Number(event.target.value));
   };
   const slide = (event) => onchange(round(Number(event.target.value), low, high));
-  const steps = (high - low) / STEPS || "any";
+  const [bottom, top] = inside(low, high), steps = (top - bottom) / STEPS || "any";
   return html`<div class="dial">
     <span aria-hidden="true">${label}</span>
-    <input type="range" min=${low} max=${high} step=${steps} value=${value} aria-label=${`${name}, slider`} aria-valuetext=${`${value} ${unit}`} onInput=${slide} />
+    <input type="range" min=${bottom} max=${top} step=${steps} value=${value} aria-label=${`${name}, slider`} aria-valuetext=${`${value} ${unit}`} onInput=${slide} />
     <input type="number" step="any" value=${typed ? text : String(value)} aria-label=${name} onInput=${type} />
     <span aria-hidden="true" class="muted">${unit}</span>
   </div>`;
@@ -29,6 +29,15 @@ export function middle(low, high) {
 
 /** Round a value to a thousandth of the order of its range, so that it fits into the input. */
 function round(value, low, high) {
-  const decimals = high > low ? 2 - Math.floor(Math.log10(high - low)) : 3;
-  return Number(value.toFixed(Math.min(Math.max(decimals, 0), 6)));
+  return Number(value.toFixed(decimals(low, high)));
+}
+
+/** Return the ends of a range, rounded inwards. */
+function inside(low, high) {
+  const factor = 10 ** decimals(low, high), [bottom, top] = [Math.ceil(low * factor) / factor, Math.floor(high * factor) / factor];
+  return top > bottom ? [bottom, top] : [low, high];
+}
+
+function decimals(low, high) {
+  return high > low ? Math.min(Math.max(2 - Math.floor(Math.log10(high - low)), 0), 6) : 3;
 }
