@@ -26,9 +26,9 @@ UPRIGHT = """async (gravity) => {
   return times(gravityAlignment(gravity), gravity);
 }"""
 SEEN = """async ([points, ratio]) => {
-  const { acrossPlane, eyeFor } = await import("/dashboard/pages/arm/camera.js");
+  const { acrossPlane, cameraFor } = await import("/dashboard/pages/arm/camera.js");
   const direction = acrossPlane(points);
-  return [direction, eyeFor(direction, [1, 0.6, 0.8], ratio, false)];
+  return [direction, cameraFor(direction, [1, 0.6, 0.8], ratio, false).eye];
 }"""
 LINKS = "(plot) => plot.data[0].x"
 """Coordinates of the frames along one axis, in Plotly's data."""
@@ -76,8 +76,8 @@ def test_camera_sees_the_whole_scene_across_the_plane_of_the_arm(
     right /= np.linalg.norm(right)
     corners = np.array(np.meshgrid([-0.5, 0.5], [-0.3, 0.3], [-0.4, 0.4])).reshape(3, -1).T
     away, tangent = (position - corners) @ direction, np.tan(np.pi / 8)  # half of the angle of Plotly's camera
-    assert (abs(corners @ right) < away * tangent * ratio).all()
-    assert (abs(corners @ np.cross(direction, right)) < away * tangent).all()
+    assert (abs((corners - position) @ right) < away * tangent * ratio).all()
+    assert (abs((corners - position) @ np.cross(direction, right)) < away * tangent).all()
 
 
 def test_every_joint_of_the_drawing_has_its_colour(visitor: Visitor, arm: str) -> None:

@@ -3,6 +3,7 @@
 const FIELD = Math.PI / 8; // half of the vertical angle of Plotly's camera
 const TURN = 0.35, RISE = 0.25; // rotation of the eye away from the normal of the plane, so that depth is visible, rad
 const ROOM = 1.06, LABELS = 1.12; // spare distance, for the border and for the labels of the axes
+const ROUNDS = 6; // of centring
 const STEEP = 0.75; // sine of the elevation above which the arm lies flat and is seen from above
 
 /** Return the unit vector to the eye: across the plane of the points, along the direction of their least spread. */
@@ -17,15 +18,24 @@ export function acrossPlane(points) {
   return [Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation)];
 }
 
-/** Return the position of the eye from which a box of these sides, around the origin, is inside a frame width / height. */
-export function eyeFor(direction, sides, ratio, labels) {
+/** Return Plotly's camera {eye, center} that shows a box of these sides, around the origin, in the middle of a frame width / height. */
+export function cameraFor(direction, sides, ratio, labels) {
   const [x, y] = direction, flat = Math.hypot(x, y);
   const right = [-y / flat, x / flat, 0], up = cross(direction, right);
   const tan = Math.tan(FIELD), ends = [-0.5, 0.5];
   const corners = ends.flatMap((i) => ends.flatMap((j) => ends.map((k) => [i * sides[0], j * sides[1], k * sides[2]])));
-  const far = corners.map((corner) => Math.max(Math.abs(dot(corner, right)) / (tan * ratio), Math.abs(dot(corner, up)) / tan) + dot(corner, direction));
-  const distance = Math.max(...far) * (labels ? LABELS : ROOM);
-  return { x: distance * direction[0], y: distance * direction[1], z: distance * direction[2] };
+  let center = [0, 0, 0], distance = 0;
+  for (let round = 0; round < ROUNDS; round += 1) {
+    const seen = corners.map((corner) => [right, up, direction].map((each) => dot(corner, each) - dot(center, each)));
+    distance = Math.max(...seen.map(([side, height, depth]) => Math.max(Math.abs(side) / (tan * ratio), Math.abs(height) / tan) + depth));
+    if (round === ROUNDS - 1) break;
+    const heights = seen.map(([, height, depth]) => height / (distance - depth));
+    const shift = (distance * (Math.max(...heights) + Math.min(...heights))) / 2; // near corners appear larger
+    center = center.map((each, k) => each + shift * up[k]);
+  }
+  distance *= labels ? LABELS : ROOM;
+  const point = ([px, py, pz]) => ({ x: px, y: py, z: pz });
+  return { center: point(center), eye: point(center.map((each, k) => each + distance * direction[k])) };
 }
 
 /** Return the eigenvector of the smallest eigenvalue of a symmetric matrix, by Jacobi rotations. */

@@ -3,7 +3,7 @@
 import { css, withOpacity, jointColour } from "../../colours.js";
 import { shortNames } from "../../format.js";
 import { escapeMarkup, plot } from "../../plots.js";
-import { acrossPlane, eyeFor } from "./camera.js";
+import { acrossPlane, cameraFor } from "./camera.js";
 import { add, frames, gravityAlignment, massCentres, scaled, times } from "./kinematics.js";
 
 const AXIS = 0.12; // half-length of an axis, relative to the size of the arm
@@ -119,7 +119,7 @@ class Arm {
     });
     return {
       height, hovermode: "closest", showlegend: false, margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "arm",
-      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: eyeFor(this.eye, sides, ratio, labels) } },
+      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: cameraFor(this.eye, sides, ratio, labels) },
     };
   }
 
