@@ -18,11 +18,6 @@ export function massCentres(inertia) {
   return inertia.bodies.map(({ plausible: { mass, first_moment: moment } }) => moment.map((each) => each / mass));
 }
 
-/** Return the positions in the middle of the training range, in the order of the data. */
-export function midRange({ q: { min, max } }) {
-  return min.map((low, joint) => (low + max[joint]) / 2);
-}
-
 /** Return the shortest rotation that aligns gravity with −z; the identity if gravity is unknown. */
 export function gravityAlignment(gravity) {
   const length = Math.hypot(...gravity);
