@@ -3,7 +3,7 @@
 import { ApiError } from "./api.js";
 import { counted } from "./format.js";
 import { html, render, useCallback, useEffect, useMemo, useRef, useState } from "./preact.js";
-import { notice } from "./ui.js";
+import { notice } from "./dialogs.js";
 
 /** Make the `render` function of a page from its component. It receives `{...params, query, signal, title}`. */
 export function page(Component) {

@@ -3,7 +3,7 @@
 import { del, get, path } from "../api.js";
 import { Await, Button, Heading, Link, page, Tabs, useRead } from "../components.js";
 import { html, useEffect, useState } from "../preact.js";
-import { confirm, notice } from "../ui.js";
+import { confirm, notice } from "../dialogs.js";
 import { Corrections, ReadAgain, useReading } from "./data/again.js";
 import { ExcitationTab, FrictionTab, PreparationTab, TimingTab } from "./data/figures.js";
 import { Warnings } from "./data/findings.js";

@@ -4,7 +4,7 @@ import { get, path, post } from "../api.js";
 import { Await, Badge, Button, Card, Facts, Heading, Link, page, Progress, useRead } from "../components.js";
 import { count, percent, seconds, sentence, when } from "../format.js";
 import { html, useCallback, useEffect, useState } from "../preact.js";
-import { confirm, notice } from "../ui.js";
+import { confirm, notice } from "../dialogs.js";
 import { observe } from "./job/course.js";
 import { follow } from "./job/following.js";
 import { Objective, OBJECTIVE_HINT } from "./job/objective.js";

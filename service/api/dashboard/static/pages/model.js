@@ -5,7 +5,7 @@ import { Await, Badge, Button, Heading, Link, page, Tabs, useRead } from "../com
 import { when } from "../format.js";
 import { JointVerdicts } from "../jointverdicts.js";
 import { html, useEffect, useRef, useState } from "../preact.js";
-import { notice } from "../ui.js";
+import { notice } from "../dialogs.js";
 import { VerdictNote } from "../verdicts.js";
 import { Warnings } from "../warnings.js";
 import { Accuracy } from "./model/accuracy.js";

@@ -3,7 +3,7 @@
 import { path, post } from "../../api.js";
 import { Button, Card, useRead } from "../../components.js";
 import { html, useState } from "../../preact.js";
-import { notice } from "../../ui.js";
+import { notice } from "../../dialogs.js";
 import { describeOptions } from "./findings.js";
 import { ImportOptions, queryOf, valueOf, withOption } from "./options.js";
 import { readRobots } from "./robot_choice.js";

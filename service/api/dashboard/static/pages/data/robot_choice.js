@@ -5,7 +5,7 @@ import { Button, ErrorBox, Field } from "../../components.js";
 import { MissingExtra, useMissing } from "../../extras.js";
 import { counted } from "../../format.js";
 import { html, useRef, useState } from "../../preact.js";
-import { notice } from "../../ui.js";
+import { notice } from "../../dialogs.js";
 import { Prose } from "./findings.js";
 
 /** Meanings of the effort of a recording. */

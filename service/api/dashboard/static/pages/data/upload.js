@@ -5,7 +5,7 @@ import { Button, Card, Field, Link, Progress, useRead } from "../../components.j
 import { MissingExtra, useMissing } from "../../extras.js";
 import { bytes, counted, sentence } from "../../format.js";
 import { html, useEffect, useRef, useState } from "../../preact.js";
-import { notice } from "../../ui.js";
+import { notice } from "../../dialogs.js";
 import { describeOptions } from "./findings.js";
 import { ImportOptions, queryOf, withOption } from "./options.js";
 import { readRobots } from "./robot_choice.js";

@@ -4,12 +4,13 @@ import { get, path } from "../../api.js";
 import { jointVar } from "../../colours.js";
 import { Await, Card, Table, useRead } from "../../components.js";
 import { count, nmse, number, percent, shortNames, torqueUnit } from "../../format.js";
+import { LearningCurve } from "../../learning_curve.js";
+import { JointVerdicts } from "../../jointverdicts.js";
 import { html } from "../../preact.js";
-import { JointBadge, VerdictNote } from "../../verdicts.js";
+import { SelectionCard } from "../../selection.js";
+import { VerdictNote } from "../../verdicts.js";
 import { Warnings } from "../data/findings.js";
-import { LearningCurve } from "./learning.js";
 import { Objective, OBJECTIVE_HINT } from "./objective.js";
-import { Selection } from "./selection.js";
 import { HELD_OUT_NOTE } from "./words.js";
 
 const ADVICE = {
@@ -38,7 +39,7 @@ export function Result({ job, course }) {
       <${Warnings} texts=${[...found.warnings, ...(found.lineage.holdout?.warnings ?? [])]} />
     <//>
     <${LearningCurve} version=${found} />
-    <${Selection} version=${found} />
+    <${SelectionCard} version=${found} />
     <${Chosen} job=${job} course=${course} estimator=${found.selection?.chosen ?? found.estimator} />`}<//>`;
 }
 
@@ -57,17 +58,8 @@ function Figures({ version }) {
 }
 
 function Judged({ version, held }) {
-  const names = shortNames(version.joint_names);
-  const columns = [
-    jointColumn(names),
-    { label: "RMSE", numeric: true, cell: ({ each }) => `${number(each.rmse)} ${each.unit}` },
-    { label: "Of range", numeric: true, cell: ({ each }) => percent(each.range_share) },
-    { label: "Coverage", numeric: true, cell: ({ each }) => percent(each.coverage, 0) },
-    { label: "Level", cell: ({ each }) => html`<${JointBadge} joint=${each} />` },
-  ];
-  const samples = held?.samples ? `On ${count(held.samples)} held-out samples` : "By joint";
-  return html`<${Table} columns=${columns} rows=${version.verdict.joints.map((each, joint) => ({ each, joint }))} caption=${samples} />
-    <p class="hint">Of range: RMSE as a share of the range of the torque. Coverage: share of the measurements inside the 95\u00a0% interval.${held?.learnt && ` ${HELD_OUT_NOTE}`}</p>`;
+  const samples = held?.samples ? `On ${count(held.samples)} held-out samples. ` : "";
+  return html`<p class="hint">${samples}${held?.learnt && HELD_OUT_NOTE}</p><${JointVerdicts} verdict=${version.verdict} />`;
 }
 
 function Trained({ version, figures }) {

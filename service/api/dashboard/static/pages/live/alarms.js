@@ -4,7 +4,7 @@ import { path, post } from "../../api.js";
 import { Badge, Button, Card } from "../../components.js";
 import { counted, sentence, when } from "../../format.js";
 import { html, useState } from "../../preact.js";
-import { confirm, notice } from "../../ui.js";
+import { confirm, notice } from "../../dialogs.js";
 
 const FEW = 2;
 const BADGES = { promotion: "good", payload: "plain" };

@@ -4,7 +4,7 @@ import { get, path, post, put } from "../../api.js";
 import { Button, Choice } from "../../components.js";
 import { count, counted, seconds, when } from "../../format.js";
 import { html, useEffect, useState } from "../../preact.js";
-import { confirm, notice } from "../../ui.js";
+import { confirm, notice } from "../../dialogs.js";
 
 const ON_CHANGE = [["hold", "pause learning"], ["adapt", "adapt"], ["learn", "continue learning"]];
 const MEMORIES_S = [60, 600, 3600, 86400, 604800];

@@ -4,7 +4,8 @@ import { Badge, Card, Facts, Link, Table } from "../../components.js";
 import { bytes, count, number, percent, scientific, seconds, shortNames, when } from "../../format.js";
 import { Joint } from "../../jointbars.js";
 import { html } from "../../preact.js";
-import { LearningCurveCard, SelectionCard } from "../../training.js";
+import { LearningCurve } from "../../learning_curve.js";
+import { SelectionCard } from "../../selection.js";
 import { heldOut, HELD_OUT_NOTE } from "../job/words.js";
 
 /** The tab. */
@@ -14,7 +15,7 @@ export function Lineage({ version, datasets }) {
   return html`
     <${Card} title=${`Version ${version.version}`}><${Facts} pairs=${origin(version)} /><//>
     <${SelectionCard} version=${version} />
-    <${LearningCurveCard} version=${version} />
+    <${LearningCurve} version=${version} />
     <${TrainedOn} from=${from} datasets=${datasets} />
     <${Figures} version=${version} />
     <${Card} title="Fit">

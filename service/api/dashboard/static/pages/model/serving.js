@@ -1,7 +1,7 @@
 // Let a version serve, after a confirmation: connected robots are affected.
 
 import { put } from "../../api.js";
-import { confirm } from "../../ui.js";
+import { confirm } from "../../dialogs.js";
 
 /** Return label and kind of the button that lets a version serve. */
 export function servingButton({ version, verdict }) {

@@ -4,7 +4,7 @@ import { del, path, post } from "../../api.js";
 import { Badge, Button, Card, Choice, Field, Listing, Table } from "../../components.js";
 import { ago, when } from "../../format.js";
 import { html, useRef, useState } from "../../preact.js";
-import { confirm } from "../../ui.js";
+import { confirm } from "../../dialogs.js";
 import { VERDICT_HINT, verdictColumns } from "../../verdicts.js";
 import { Compare } from "./compare.js";
 import { exportVersion } from "./export.js";

@@ -1,10 +1,10 @@
-// Learning curve of a version: error on held-out samples against training samples.
+// Learning curve of a version: error on held-out samples against training samples; shown with the version and its job.
 
-import { Card, Drawn, Table } from "../../components.js";
-import { Export } from "../../exporting.js";
-import { count, nmse } from "../../format.js";
-import { line, plot } from "../../plots.js";
-import { html } from "../../preact.js";
+import { Card, Drawn, Table } from "./components.js";
+import { Export } from "./exporting.js";
+import { count, nmse } from "./format.js";
+import { line, plot } from "./plots.js";
+import { html } from "./preact.js";
 
 /** The card, if the version has a learning curve. */
 export function LearningCurve({ version }) {
