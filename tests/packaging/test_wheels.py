@@ -127,12 +127,14 @@ def test_wheel_of_the_service_serves_model_pages_and_guide(server):
 
 
 @pytest.mark.skipif("torch" in BASE, reason="torch is part of the base")
-def test_service_is_small_and_includes_plotly(server):
+def test_service_is_small_and_includes_the_libraries_of_the_dashboard(server):
     files = (each for each in Installed.place.rglob("*") if each.is_file() and not each.is_symlink())
     # without bytecode and compiled kernels, which the start has written
     size = sum(each.stat().st_size for each in files if "__pycache__" not in each.parts)
     assert size < MAX_SERVICE_MB * 1_000_000
     assert len(server.client.get("/dashboard/plotly/cartesian.js", follow_redirects=True).content) > 1_000_000
+    for name in ("preact-11.2.0.js", "preact-hooks-11.2.0.js", "htm-3.1.1.js"):
+        assert server.client.get(f"/dashboard/libraries/{name}").status_code == 200
 
 
 def test_wheel_of_the_client_works_alone(server, dist, tmp_path):

@@ -89,11 +89,11 @@ def test_card_shows_error_of_each_joint_in_torque_units_and_share_of_range(
 
 def test_long_joint_names_fit_into_the_card(windows: Visit, dashboard: Dashboard, judged: dict[str, Any]) -> None:
     joints = judged["verdict"]["joints"]
-    long = [{**each, "joint": f"{number}{'_shoulder' * 3}_joint"} for number, each in enumerate(joints)]
+    long = [{**each, "joint": f"{number}{'_shoulder' * 3}_{number}"} for number, each in enumerate(joints)]
     phone = windows(dashboard.server.url, size=PHONE, touch=True)
     changed(phone.page, "judged", verdict={**judged["verdict"], "joints": long})
     place = card(phone.open("#/"), "judged")
-    expect(place).to_contain_text("_shoulder_shoulder_shoulder_joint")
+    expect(place).to_contain_text("_shoulder_shoulder_shoulder_")
     assert phone.overflow() <= 0
     boxes = place.locator(".most > *").evaluate_all(BOXES)
     assert all(one["bottom"] <= other["top"] or one["right"] <= other["left"] for one, other in pairwise(boxes))

@@ -33,49 +33,6 @@ def there(kept: ElementHandle) -> bool:
     return kept.evaluate("(each) => each.isConnected")
 
 
-REFRESHED = """async () => {
-  const { h, refresh } = await import("/dashboard/dom.js");
-  const row = (id, text) => h("tr", {"data-key": id}, h("td", {}, h("a", {href: `#/${id}`}, text)));
-  const place = h("table", {}, row("a", "A"), row("b", "B"));
-  document.body.append(place);
-  const [a, b] = place.querySelectorAll("a");
-  a.focus();
-  const moved = new MutationObserver(() => null);
-  moved.observe(place, {childList: true, subtree: true});
-  refresh(place, row("c", "C"), row("a", "more of A"), row("b", "B"));
-  const texts = [...place.querySelectorAll("a")].map((each) => each.textContent);
-  const gone = moved.takeRecords().flatMap((each) => [...each.removedNodes]);
-  const added = {links: [...place.querySelectorAll("a")], focus: document.activeElement, gone};
-  refresh(place, row("b", "B"), row("a", "A"));
-  const turned = {links: [...place.querySelectorAll("a")], focus: document.activeElement};
-  refresh(place, row("d", "D"));
-  const control = h("button", {onclick: () => null}, "old");
-  const words = h("p", {class: "one", title: "t"}, "words ", h("b", {}, 1));
-  const [b1, text] = [words.querySelector("b"), words.firstChild];
-  const other = h("div", {}, control, words);
-  refresh(other, h("button", {onclick: () => null}, "new"), h("p", {class: "two"}, "other ", h("b", {}, 2), " more"));
-  const made = other.firstChild;
-  refresh(other, null, made, h("p", {}, "last"));
-  place.remove();
-  return {
-    added: texts,
-    kept: added.links[1] === a && added.links[2] === b && added.focus === a && added.gone.length === 0,
-    turned: turned.links[0] === b && turned.links[1] === a && turned.focus === a,
-    replaced: ![a, b].some((each) => place.contains(each)) && place.textContent === "D",
-    control: made !== control && made.textContent === "new" && other.firstChild === made,
-    words: words.firstChild === text && !words.contains(b1) && !words.hasAttribute("title") && other.contains(words),
-    shown: other.outerHTML,
-  };
-}"""
-
-
-def test_refresh_changes_nodes_in_place(visitor: Visitor) -> None:
-    found = visitor.open("#/train").evaluate(REFRESHED)
-    assert found.pop("added") == ["C", "more of A", "B"]
-    assert found.pop("shown") == "<div><button>new</button><p>last</p></div>"
-    assert all(found.values()), found
-
-
 @pytest.mark.parametrize("route", [slow("#/"), "#/jobs"])
 def test_new_job_keeps_existing_links(visitor: Visitor, dashboard: Dashboard, route: str) -> None:
     page = visitor.open(route)

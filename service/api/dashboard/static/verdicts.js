@@ -3,6 +3,7 @@
 import { Badge } from "./components.js";
 import { percent } from "./format.js";
 import { html } from "./preact.js";
+import { Prose } from "./prose.js";
 
 const KINDS = { usable: "good", usable_in_range: "good", too_uncertain: "warn", wrong: "bad", not_judged: "plain" };
 
@@ -18,7 +19,7 @@ export function JointBadge({ joint: { level } }) {
 
 /** A note with the level of a verdict, why, and what to do. */
 export function VerdictNote({ verdict }) {
-  return html`<p class=${verdict.serves ? "verdict" : "verdict banner"} role="note"><${VerdictBadge} verdict=${verdict} /> ${verdict.reason} <span class="muted">${verdict.action}</span></p>`;
+  return html`<p class=${verdict.serves ? "verdict" : "verdict banner"} role="note"><${VerdictBadge} verdict=${verdict} /> <${Prose} text=${verdict.reason} /> <span class="muted">${verdict.action}</span></p>`;
 }
 
 /** Explanation of the columns, shown below a list. */
@@ -31,7 +32,7 @@ export function verdictColumns(of) {
     return known.length ? choose(...known) : null;
   };
   const error = figure("range_share", Math.max), coverage = figure("coverage", Math.min);
-  const why = (verdict) => html`<details class="why"><summary><${VerdictBadge} verdict=${verdict} /></summary><p class="hint">${verdict.reason} ${verdict.action}</p></details>`;
+  const why = (verdict) => html`<details class="why"><summary><${VerdictBadge} verdict=${verdict} /></summary><p class="hint"><${Prose} text=${verdict.reason} /> ${verdict.action}</p></details>`;
   return [
     { label: "Verdict", value: (row) => of(row)?.label ?? null, cell: (row) => (of(row) ? why(of(row)) : "–") },
     { label: "Error", numeric: true, value: error, cell: (row) => percent(error(row), 1) },

@@ -1,11 +1,7 @@
 // Warnings of the service as chips that open their text.
 
 import { html } from "./preact.js";
-
-/** A sentence of the service, in which backticks mark code. */
-export function Prose({ text }) {
-  return text.split("`").map((part, index) => (index % 2 ? html`<code>${part}</code>` : part));
-}
+import { Prose } from "./prose.js";
 
 /** Chips with the first clause of each warning; a chip opens its whole text. */
 export function Warnings({ texts }) {

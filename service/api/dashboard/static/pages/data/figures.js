@@ -4,7 +4,8 @@ import { jointVar } from "../../colours.js";
 import { Badge, Card, Facts, Table } from "../../components.js";
 import { count, number, percent, seconds, shortNames } from "../../format.js";
 import { html } from "../../preact.js";
-import { Prose, Sentences } from "./findings.js";
+import { Prose } from "../../prose.js";
+import { Sentences } from "./findings.js";
 
 /** Rate, jitter, gaps, and the lag of the torque. */
 export function TimingTab({ report, joints }) {

@@ -2,7 +2,7 @@
 
 import { Field } from "../../components.js";
 import { html } from "../../preact.js";
-import { LABELS } from "./findings.js";
+import { LABELS } from "../../prose.js";
 import { EFFORTS, RobotChoice } from "./robot_choice.js";
 
 const QUANTITIES = [

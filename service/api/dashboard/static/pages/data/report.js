@@ -4,7 +4,7 @@ import { jointVar } from "../../colours.js";
 import { Card, Facts } from "../../components.js";
 import { count, counted, number, seconds, shortNames, when } from "../../format.js";
 import { html } from "../../preact.js";
-import { Prose } from "./findings.js";
+import { Prose } from "../../prose.js";
 
 const CONVENTIONS = { gravity_included: "gravity included", gravity_compensated: "gravity compensated" };
 const MAX_VISIBLE = 3; // recommendations that are visible at once

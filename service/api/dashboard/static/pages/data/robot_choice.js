@@ -6,7 +6,7 @@ import { MissingExtra, useMissing } from "../../extras.js";
 import { counted } from "../../format.js";
 import { html, useRef, useState } from "../../preact.js";
 import { notice } from "../../dialogs.js";
-import { Prose } from "./findings.js";
+import { Prose } from "../../prose.js";
 
 /** Meanings of the effort of a recording. */
 export const EFFORTS = {

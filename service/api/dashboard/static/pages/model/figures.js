@@ -34,11 +34,13 @@ export function AllFigures({ evaluation }) {
 export function Boxes({ evaluation: { joint_names: joints, stretches } }) {
   const names = shortNames(joints);
   const what = stretches.kind === "episodes" ? counted(stretches.samples.length, "episode") : `${counted(stretches.samples.length, "equal segment")} of the recording`;
+  const known = stretches.nmse.flat().filter((value) => value > 0);
+  const decades = Math.max(...known) > 10 * Math.min(...known) ? { dtick: 1 } : {}; // a tick at each, if there are several
   const draw = () => [
     stretches.nmse.map((values, joint) => ({
       type: "box", y: values, name: names[joint], colour: joint, boxpoints: "all", jitter: 0.5, pointpos: 0, marker: { size: 4, opacity: 0.7 }, hovertemplate: "%{y:.3g}",
     })),
-    { y: "nMSE", height: HEIGHT, margin: { ...MARGIN, b: 16 }, showlegend: false, hovermode: "closest", xaxis: { showticklabels: false }, yaxis: { type: "log", exponentformat: "power", dtick: 1 } },
+    { y: "nMSE", height: HEIGHT, margin: { ...MARGIN, b: 16 }, showlegend: false, hovermode: "closest", xaxis: { showticklabels: false }, yaxis: { type: "log", exponentformat: "power", ...decades } },
   ];
   return html`
     <p class="hint">Each point is the nMSE of one of ${what}. A box contains the middle half; its line is the median. High points: motion with much worse predictions.</p>
