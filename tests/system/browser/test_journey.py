@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -81,7 +82,7 @@ def trained(visitor: Visitor) -> None:
     expect(page.get_by_role("heading", level=1, name="Training my-arm")).to_be_visible()
     version = page.get_by_role("link", name="View version 1")
     expect(version).to_be_visible(timeout=LONG_MS)
-    expect(page.get_by_text("held-out samples")).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^On \d+ held-out samples"))).to_be_visible()
     visitor.settled()
     assert audit(page) == []
     version.click()
