@@ -54,7 +54,7 @@ def list_models(learners: Learners, part: Page) -> OverviewPage:
         if (version := versions.get(key)) is None:  # deleted since the first query
             continue
         manifest = version.manifest
-        last = seen.get(row.name)
+        last, served = seen.get(row.name), learners.loaded.peek(row.name)
         items.append(
             ModelOverview(
                 name=row.name,
@@ -72,7 +72,7 @@ def list_models(learners: Learners, part: Page) -> OverviewPage:
                 held=row.name in held,
                 failure=learners.status(*key).failure,
                 alarm=alarms.get(row.name),
-                lag_s=None if (served := learners.loaded.peek(row.name)) is None else learners.lag(served).seconds,
+                lag_s=None if served is None else learners.lag(served).seconds,
                 **_monitored_fields(monitors.get(row.name), served, now),
             )
         )
