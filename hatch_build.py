@@ -18,15 +18,13 @@ import urllib.request
 import zipfile
 from base64 import b64encode
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
-@dataclass(frozen=True)
-class Library:
+class Library(NamedTuple):  # not a dataclass: Hatch runs this file outside `sys.modules`, where dataclasses look
     """A package of npm, with the files that the dashboard needs.
 
     Attributes:
