@@ -65,7 +65,10 @@ def test_predict_sends_rows_with_times_as_a_trajectory():
 
 
 LOST = httpx.ReadError("lost")
-MODEL = {"name": "m", "created_at": "now", "latest_version": 1, "serving_version": 1, "aliases": {}, "versions": []}
+MODEL = {
+    **{"name": "m", "created_at": "now", "latest_version": 1, "serving_version": 1, "aliases": {}, "versions": []},
+    "thresholds": {"max_error": 0.9, "min_coverage": 0.9, "max_width": 1.0},
+}
 
 
 def scripted(*answers, reached=True, **options):

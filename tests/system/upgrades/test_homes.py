@@ -99,6 +99,7 @@ def test_models_datasets_keys_and_log_are_kept(upgraded):
     api, home = upgraded
     for model, recorded in RECORDED["models"].items():
         found = api.get(f"/v1/models/{model}").json()
+        assert found.pop("thresholds") == {"max_error": 0.9, "min_coverage": 0.9, "max_width": 1.0}
         for version in found["versions"]:  # fields of later releases
             assert version.pop("verdict")["level"] == "not_judged"
             assert version.pop("promotion")["reason"] == "not judged, as nothing was held out"
