@@ -21,7 +21,7 @@ MAX_FILES = 2000
 ENDINGS = (".xacro", ".urdf", ".xml", ".sdf")
 _INCLUDE = re.compile(r"""<xacro:include\b[^>]*\bfilename\s*=\s*["']([^"']+)["']""")
 _ARGUMENT = re.compile(r"""<xacro:arg\b[^>]*\bname\s*=\s*["'](\w+)["']""")
-_TODO = "Expand it where its packages are installed: xacro robot.urdf.xacro > robot.urdf"
+_EXPAND = "Expand it where its packages are installed: xacro robot.urdf.xacro > robot.urdf"
 
 
 def is_xacro(text: str) -> bool:
@@ -74,7 +74,7 @@ def expand_xacro(file: Path, folder: Path, arguments: Mapping[str, str]) -> str:
         names = {name for path in folder.rglob("*") if path.is_file() for name in _ARGUMENT.findall(_read(path))}
         listed = f"Its arguments are {', '.join(sorted(names))}: set xacro={min(names)}=…. Or: " if names else ""
         raise UrdfError(
-            f"xacro cannot expand {file.name}: {reason[:300].replace(str(folder), '')}. {listed}{_TODO}"
+            f"xacro cannot expand {file.name}: {reason[:300].replace(str(folder), '')}. {listed}{_EXPAND}"
         ) from None
 
 
@@ -95,11 +95,11 @@ def _confined(xacro: Any, folder: Path) -> Iterator[None]:
             if path.is_dir():
                 return str(path)
         raise UrdfError(
-            f"the xacro includes files of the package {package}. Upload a zip with the folder {package}. Or: {_TODO}"
+            f"the xacro includes files of the package {package}. Upload a zip with the folder {package}. Or: {_EXPAND}"
         )
 
     def refuse(*_: Any) -> str:
-        raise UrdfError(f"the xacro uses $(eval), $(env) or $(optenv), which are not evaluated. {_TODO}")
+        raise UrdfError(f"the xacro uses $(eval), $(env) or $(optenv), which are not evaluated. {_EXPAND}")
 
     replaced = {
         (xacro, "abs_filename_spec"): inside,

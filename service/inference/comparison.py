@@ -6,15 +6,17 @@ from collections.abc import Collection
 from math import isfinite
 
 from lipcore.data import metrics
-from lipcore.data.metrics import Comparison, Difference, evaluate
+from lipcore.data.metrics import Comparison, Difference
 from service.contract import predictions as schema
 from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
 from service.inference import texts
 from service.inference.evaluating import judge, read_dataset
-from service.models.evaluation import joint_figures
 from service.models.loaded import LoadedModels, ServedModel
+
+FIGURES = ("nmse", "rmse", "coverage", "nlpd", "interval_width", "verdict")
+"""Fields of an evaluation that a comparison has of each version."""
 
 
 def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> schema.CompareResponse:
@@ -40,11 +42,10 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
             schema.VersionFigures(
                 version=each.version,
                 revision=each.revision,
-                **joint_figures(evaluate(recorded.used.tau, *answer)),
                 in_training=trained,
-                verdict=verdict,
+                **{name: figures[name] for name in FIGURES},
             )
-            for each, answer, trained, verdict in zip(versions, answers, in_training, judged, strict=True)
+            for each, trained, figures in zip(versions, in_training, judged, strict=True)
         ],
         differences=schema.JointDifferences(
             **{

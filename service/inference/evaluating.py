@@ -147,13 +147,13 @@ def evaluate(
 
 def judge(
     loaded: LoadedModels, recorded: EvaluationData, served: ServedModel, answer: TorqueDistribution, in_training: bool
-) -> Verdict:
-    """Return the verdict on a version by its answer at the samples of a data set."""
+) -> dict[str, Any]:
+    """Return the fields of an `Evaluation` of a version's answer at the samples of a data set, and its `verdict`."""
     used = recorded.used
     figures = evaluation(used, answer, served.model.training_range)
     figures |= _repeats(loaded, served, used, in_training)
     row = store.find(loaded.database, recorded.id)
-    return _verdict(loaded, served, figures, "training" if in_training else "recording", row)
+    return {**figures, "verdict": _verdict(loaded, served, figures, "training" if in_training else "recording", row)}
 
 
 def _verdict(

@@ -112,25 +112,24 @@ def _against(
         return ServingComparison(True, texts.describe_learnt_held_out(name))
     if len(scores.rows) < 2:
         return ServingComparison(True, texts.describe_too_short(name), rmse)
-    if foreign := _find_foreign_joints(serving, trained, held_out, rmse, options):
+    if foreign := _find_foreign_joints(serving, held_out, rmse, lineage["holdout"]["rmse"], options):
         return ServingComparison(False, texts.describe_foreign_recording(name, foreign), rmse)
     serves, reason = _compare(scores.difference_from(before), name)
     return ServingComparison(serves, reason, rmse)
 
 
 def _find_foreign_joints(
-    serving: VersionRow, trained: TorqueModel, held_out: Samples, rmse: list[float] | None, options: VerdictOptions
+    serving: VersionRow, held_out: Samples, rmse: list[float] | None, own: list[float], options: VerdictOptions
 ) -> list[str]:
     """Return the joints on which a usable serving version is no better than the mean torque, unlike the new version.
 
-    The recording is then of another robot, or with another payload or torque unit.
+    The recording is then of another robot, or with another payload or torque unit. rmse, own: errors of both.
     """
     if rmse is None or not verdicts.of_version(serving.manifest, options).serves:
         return []
     limit = np.sqrt(OPTIONS.max_error) * held_out.tau.std(axis=0)
-    own = np.sqrt(np.mean((held_out.tau - answer_of(trained, held_out).mean) ** 2, axis=0))
-    foreign = (np.array(rmse) >= limit) & (own < limit)
-    return [name for name, is_foreign in zip(trained.joint_names, foreign, strict=True) if is_foreign]
+    foreign = (np.array(rmse) >= limit) & (np.array(own) < limit)
+    return [name for name, is_foreign in zip(held_out.joint_names, foreign, strict=True) if is_foreign]
 
 
 def _scores(
