@@ -39,6 +39,9 @@ ROBOT_ESTIMATORS = (RIGID, LOCAL, CHAINED_ARM)
 ESTIMATOR_CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", *ROBOT_ESTIMATORS)
 """Values of `estimator` in a request: `auto`, and the estimators of `lipcore.estimators.catalogue`."""
 
+ENERGY_ESTIMATORS = ("lip", "lip-chain", *ROBOT_ESTIMATORS)
+"""Estimators whose torque follows from energies. They offer all COMPONENTS, the others only friction."""
+
 TORCH_ESTIMATORS = ("se", "gip", "lse")
 """Estimators that torch differentiates in training, on a GPU if there is one. They need the extra `train`; their
 predictions do not."""

@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from service.api.oip import schema as oip
-from service.contract import audit, datasets, health, learning, models, overview, robots
+from service.contract import audit, datasets, health, learning, models, overview, robots, verdict
 from service.contract import jobs as training
 from service.contract import observations as observing
 from service.contract import payload as payloads
@@ -35,6 +35,7 @@ COPIES = {
 """Modules of the client, and the modules of the service that they copy."""
 WIDTH = 120
 ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
+    "verdicts": ("Verdicts on models.", (verdict.Verdict, verdict.Thresholds)),
     "datasets": ("Data sets and their reports.", (datasets.Dataset,)),
     "robots": ("Robots.", (robots.Robot, robots.RobotProfile)),
     "models": ("Models, their versions and aliases.", (models.Model, models.Version, models.Alias)),

@@ -111,18 +111,24 @@ def describe_alternatives(probabilities: Sequence[float], motion: str, differenc
 
 NOTHING_HELD_OUT = "No samples were held out of its training, so its errors are unknown."
 HOLD_OUT = "Evaluate it on another recording, or train with a held-out part."
+NO_ROWS = "No stream has sent measured torque lately, so the present errors are unknown."
+SEND_ROWS = "Send the measured torque with the motion."
 JUDGED_ON_TRAINING = "It was trained on these samples, so its errors on other motion are unknown."
 EVALUATE_OTHER = "Evaluate its held-out part or another recording."
 NO_SIGNAL = "The torque of these samples is not larger than its noise, so the errors say nothing."
 RECORD_FASTER = "Record faster and wider motion."
 JUDGED_AT_REST = "Its errors in motion are unknown: the samples stand still."
 UNKNOWN_RANGE = "Its errors outside the recorded range are unknown."
+ONLY_PRESENT_MOTION = "It predicts the present motion; its errors on other motion are unknown."
 CHECK_TORQUE = "Check sign, unit and order of the torque, then record more varied motion and train again."
 RECORD_VARIED = "Record more varied motion and train again."
 RECORD_MORE = "Record more motion of these joints and train again."
 RECORD_LONGER = "Record longer and train again."
 STAY_INSIDE = "Stay inside the recorded range, or record wider and faster motion."
 NOTHING_TO_DO = "No action is needed."
+LONG_AND_VARIED = "The recording moves long enough, and does not repeat itself."
+RECORD_OTHER_MOTION = "Record other motion, too."
+TRAIN = "Train a model to get its verdict."
 
 
 def describe_large_error(joints: str) -> str:
@@ -164,6 +170,11 @@ def describe_few_samples(joints: str) -> str:
 def describe_short(seconds: float, least: float) -> str:
     """Return that the samples are too short to judge a model."""
     return f"Only {seconds:.2g} s can be judged, at least {least:g} s are needed."
+
+
+def describe_periodic(period: float) -> str:
+    """Return that a recording repeats its motion after a period, s."""
+    return f"The motion repeats itself every {period:.2g} s, so errors on other motion stay unknown."
 
 
 def describe_repeated(share: float) -> str:

@@ -14,7 +14,7 @@ from lipcore.data.coverage import clopper_pearson
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.data.splits import Mask
+from lipcore.data.splits import Mask, Split
 from lipcore.model import texts
 from lipcore.model.torque_model import TrainingRange
 from lipcore.vocabulary import JointType
@@ -24,8 +24,9 @@ LEVELS: Final[tuple[Level, ...]] = ("wrong", "too_uncertain", "not_judged", "usa
 """Levels of a verdict, the worst first."""
 SERVING_LEVELS: Final[tuple[Level, ...]] = ("usable_in_range", "usable")
 """Levels at which a version serves without approval."""
-JudgedOn = Literal["held_out", "recording", "training", "nothing"]
-"""Samples behind a verdict: held-out part, another recording, the training data, or no samples."""
+JudgedOn = Literal["held_out", "recording", "stream", "training", "nothing"]
+"""Samples behind a verdict: held-out part, another recording, rows of streams before they were learnt, the training
+data, or no samples."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,8 @@ def judge(
 
     """
     if figures is None:
-        found = Verdict("not_judged", texts.NOTHING_HELD_OUT, texts.HOLD_OUT, "nothing")
+        why = (texts.NO_ROWS, texts.SEND_ROWS) if judged_on == "stream" else (texts.NOTHING_HELD_OUT, texts.HOLD_OUT)
+        found = Verdict("not_judged", *why, "nothing")
     else:
         found = _Judging(figures, judged_on, repeats, options).verdict()
     causes: tuple[tuple[Level, Sequence[Fault]], ...] = (("wrong", faults), ("not_judged", faulty_samples))
@@ -213,6 +215,50 @@ def judge(
         if which:
             return replace(found, level=level, reason=which[0].text, action=which[0].action)
     return found
+
+
+def judge_recording(
+    seconds: float | None,
+    moving: float | None,
+    period: float | None,
+    faults: Sequence[Fault] = (),
+    options: VerdictOptions = OPTIONS,
+) -> Verdict:
+    """Return the best verdict that a model of a recording can get, by its held-out part alone.
+
+    Args:
+        seconds: Duration of the recording, s; None if unknown.
+        moving: Share of its samples in which a joint moves; None if unknown.
+        period: Time after which its motion repeats itself, s; None if it does not.
+        faults: Its faults, the gravest first.
+        options: Thresholds.
+
+    Example:
+        >>> judge_recording(6.0, 1.0, None).reason
+        'Only 1.8 s can be judged, at least 3 s are needed.'
+
+    """
+    short = _why_too_short(None if seconds is None else Split().share * seconds, options)
+    if faults:
+        return Verdict("wrong", faults[0].text, faults[0].action, "nothing")
+    if short is not None:
+        return Verdict("not_judged", short, texts.RECORD_LONGER, "nothing")
+    if _is_at_rest(moving, options):
+        return Verdict("usable_in_range", texts.JUDGED_AT_REST, texts.RECORD_OTHER_MOTION, "nothing")
+    if period is not None:
+        return Verdict("usable_in_range", texts.describe_periodic(period), texts.RECORD_OTHER_MOTION, "nothing")
+    return Verdict("usable", texts.LONG_AND_VARIED, texts.TRAIN, "nothing")
+
+
+def _why_too_short(seconds: float | None, options: VerdictOptions) -> str | None:
+    """Return why samples of this duration are too short to judge a model; None if they are not."""
+    if seconds is None or seconds >= options.min_seconds:
+        return None
+    return texts.describe_short(seconds, options.min_seconds)
+
+
+def _is_at_rest(moving: float | None, options: VerdictOptions) -> bool:
+    return moving is not None and moving < options.min_moving
 
 
 @dataclass(frozen=True)
@@ -234,8 +280,7 @@ class _Judging:
             ("not_judged", few, texts.describe_few_samples(self._list(few, self._counts())), texts.RECORD_LONGER),
         ]
         everywhere = np.ones(len(figures.nmse), np.bool_)
-        if figures.seconds is not None and figures.seconds < self.options.min_seconds:
-            short = texts.describe_short(figures.seconds, self.options.min_seconds)
+        if (short := _why_too_short(figures.seconds, self.options)) is not None:
             checks.append(("not_judged", everywhere, short, texts.RECORD_LONGER))
         if self.judged_on == "training":
             checks.append(("not_judged", everywhere, texts.JUDGED_ON_TRAINING, texts.EVALUATE_OTHER))
@@ -281,11 +326,11 @@ class _Judging:
         """Return why the model is not known to be right outside the training range; None if it is."""
         if self.repeats is not None and self.repeats >= repetition.OPTIONS.repeated_share:
             return texts.describe_repeated(self.repeats)
-        moving, outside = self.figures.moving, self.figures.outside
-        if moving is not None and moving < self.options.min_moving:
+        if _is_at_rest(self.figures.moving, self.options):
             return texts.JUDGED_AT_REST
+        outside = self.figures.outside
         if outside is None:
-            return texts.UNKNOWN_RANGE
+            return texts.ONLY_PRESENT_MOTION if self.judged_on == "stream" else texts.UNKNOWN_RANGE
         count = outside.share * self.figures.independent
         if count.min() < self.options.min_outside:
             return texts.describe_few_outside(outside.share, float(count.min()))

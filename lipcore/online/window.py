@@ -19,14 +19,15 @@ class Window:
 
     def __init__(self, seconds: float, n_joints: int) -> None:
         self.seconds, self._n_joints = seconds, n_joints
-        self._length = max(seconds / PARTS, 1.0)
+        self.span_s = max(seconds / PARTS, 1.0)
+        """Length of a bucket, s."""
         self._buckets: tuple[tuple[int, Record, Counter[str], IntervalCoverage], ...] = ()
 
     def add(
         self, record: Record | None, counts: Mapping[str, int], at: float, held: IntervalCoverage | None = None
     ) -> None:
         """Add a batch's record, counts and coverage (`held`) at a Unix time, s. Only one thread at a time may add."""
-        number = int(at // self._length)
+        number = int(at // self.span_s)
         empty = number, Record.empty(self._n_joints), Counter[str](), IntervalCoverage.none(self._n_joints)
         *rest, last = self._buckets or (empty,)
         if last[0] != number:
@@ -47,7 +48,11 @@ class Window:
 
     def course(self, now: float) -> list[tuple[float, Record]]:
         """Return the records of the window's buckets, oldest first, each with the Unix time at which it began, s."""
-        return [(number * self._length, record) for number, record, *_ in self._buckets if self._holds(number, now)]
+        return [(number * self.span_s, record) for number, record, *_ in self._buckets if self._holds(number, now)]
+
+    def count_spans(self, now: float) -> int:
+        """Return the number of buckets with predicted rows in the window before a Unix time, s."""
+        return sum(record.rows > 0 for _, record in self.course(now))
 
     def counts(self, now: float) -> Counter[str]:
         """Return the sum of the counts in the window before a Unix time, s."""
@@ -61,9 +66,9 @@ class Window:
 
     def set_clock(self, step: float) -> None:
         """Shift the buckets after the clock was set by `step`, s."""
-        moved = round(step / self._length)
+        moved = round(step / self.span_s)
         self._buckets = tuple((bucket[0] + moved, *bucket[1:]) for bucket in self._buckets)
 
     def _holds(self, number: int, now: float) -> bool:
         """Whether a bucket lies in the window before a Unix time, s; one that a wrong clock dated later does not."""
-        return -self.seconds < (number + 1) * self._length - now <= 2 * self._length
+        return -self.seconds < (number + 1) * self.span_s - now <= 2 * self.span_s

@@ -187,6 +187,8 @@ def _print(dataset: Dataset) -> None:
     for table in tables.report_tables(report, dataset.joint_names):
         out.print(table)
     echo(f"  {report.excitation.text}")
+    best = dataset.learnability
+    echo(f"a model of it can be {best.label} at best: {in_shell(best.reason)} {best.action}")
     for line in report.warnings:
         out.print(f"[yellow]warning:[/yellow] {escape(in_shell(line))}", highlight=False)
     for remedy in report.remedies if report.upload_options is not None else []:

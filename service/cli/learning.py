@@ -63,6 +63,7 @@ def _print_quality(quality: Quality) -> None:
     if not seen.rows:
         echo(f"no rows received in the last {seen.seconds:.0f} s")
         return
+    echo(f"{quality.verdict.label}: {quality.verdict.reason} {quality.verdict.action}")
     title = f"prediction of {counted(seen.rows, 'row')} of the last {seen.seconds:.0f} s, before learning from them"
     out.print(quality_table(title, quality.joint_names, seen))
 

@@ -22,7 +22,8 @@ from service.foundation.text import counted, percent
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
     from lipserve.records.models import Model as ModelRecord
-    from lipserve.records.models import Selection, Verdict
+    from lipserve.records.models import Selection
+    from lipserve.records.verdicts import Verdict
     from lipserve.results.arm import Version as VersionRecord
     from service.contract.states import PromotionOption
 

@@ -11,7 +11,8 @@ from rich.table import Table
 
 from lipserve.records.datasets import AgainstRobot, DatasetReport, JointExcitation, JointNoise, Weight
 from lipserve.records.learning import QualityWindow
-from lipserve.records.models import Selection, Verdict
+from lipserve.records.models import Selection
+from lipserve.records.verdicts import Verdict
 from lipserve.results.arm import Arm
 from lipserve.results.evaluation import Comparison
 from lipserve.results.series import Prediction

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field
 
 from lipcore.vocabulary import JointType, TorqueConvention
+from service.contract import verdict
 
 Verdict = Literal["well", "poorly", "not determined"]
 """How well the data determine a friction coefficient; `FrictionOptions` has the thresholds."""
@@ -248,6 +249,7 @@ class Dataset(BaseModel):
     sha256: str = Field(description="Hash of the stored samples")
     joint_names: list[str]
     torque_convention: TorqueConvention
+    learnability: verdict.Verdict = Field(description="Best verdict that a version trained on it alone can get")
     report: DatasetReport
 
 

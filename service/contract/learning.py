@@ -11,6 +11,7 @@ from lipcore.vocabulary import CODES, JointType
 from service.contract.models import VersionNumber
 from service.contract.observations import MAX_SEQUENCE, LearningOptions, State
 from service.contract.payload import LivePayload
+from service.contract.verdict import Verdict
 from service.foundation.errors import invalid_request
 
 REPLAYABLE = tuple(code for code in CODES if code not in ("learnt", "non_finite", "edge", "late"))
@@ -52,6 +53,7 @@ class Quality(BaseModel):
     level: float = Field(LEVEL, description="Probability of the interval")
     windows: list[QualityWindow]
     scale: list[float] = Field(description="Per joint, the present factor on the half width of intervals")
+    verdict: Verdict = Field(description="Verdict on the intervals in responses, by the shortest window")
 
 
 class Observation(BaseModel):
@@ -385,6 +387,7 @@ class LiveStatus(BaseModel):
     level: float = Field(LEVEL, description="Probability of the interval")
     windows: list[QualityWindow] = Field(description="Prediction quality over sliding windows")
     scale: list[float] = Field(description="Per joint, the present factor on the half width of intervals")
+    verdict: Verdict = Field(description="Verdict on the intervals in responses, by the shortest window")
     payloads: list[LivePayload] | None = Field(description="Payload of each stream; null without arm geometry")
     answers: LiveAnswers | None = Field(
         description="Null at first, and if the service has too many models to count them separately"

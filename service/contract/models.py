@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from lipcore.vocabulary import JointType, TorqueConvention
+from lipcore.vocabulary import ComponentName, JointType, TorqueConvention
 from service.contract.states import PromotionOption
 from service.contract.verdict import Thresholds, Verdict
 
@@ -84,6 +84,7 @@ class Version(BaseModel):
     created_at: str
     job: str | None = Field(description="Job that trained it; null for an imported or shipped version")
     estimator: str
+    components: list[ComponentName] = Field(description="Components of the torque that it offers")
     joint_names: list[str]
     joint_types: list[JointType]
     torque_convention: TorqueConvention

@@ -79,8 +79,8 @@ class Verdict(BaseModel):
     reason: str = Field(description="Why, in one sentence")
     action: str = Field(description="What to do")
     judged_on: JudgedOn = Field(
-        description="`held_out`: the held-out part of its training; `recording`: another data set; `training`: samples "
-        "that it has learnt; `nothing`"
+        description="`held_out`: the held-out part of its training; `recording`: another data set; `stream`: rows of "
+        "streams before they were learnt; `training`: samples that it has learnt; `nothing`"
     )
     outside: float | None = Field(description="Share of the samples outside the training range; null if unknown")
     repeats: float | None = Field(description="Share of the samples that repeat the training motion; null if unknown")

@@ -21,7 +21,7 @@ from lipcore.data.motion import spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
-from service.contract.datasets import MAX_PREVIEW_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
+from service.contract.datasets import MAX_PREVIEW_STARTS, Dataset, DatasetPage, DatasetReport, Preview, PreviewColumn
 from service.contract.states import ACTIVE
 from service.contract.uploads import RereadQuery, UploadQuery
 from service.datasets.mapping.checks import MIN_SAMPLES
@@ -31,6 +31,7 @@ from service.datasets.report.constants import estimate_constants
 from service.datasets.report.making import make_report
 from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, invalid_request, not_found
+from service.models import verdicts
 from service.robots.store import profile_of
 from service.runtime import cage
 from service.storage import sample_file
@@ -234,7 +235,9 @@ def _array(staged: Staged, name: str) -> NDArray[np.float64] | NDArray[np.int64]
 
 
 def _show(row: DatasetRow) -> Dataset:
-    return Dataset.model_validate(row, from_attributes=True)
+    report = DatasetReport.model_validate(row.report)
+    fields = {name: getattr(row, name) for name in Dataset.model_fields if name not in ("learnability", "report")}
+    return Dataset(**fields, learnability=verdicts.of_recording(row), report=report)
 
 
 MAX_PREVIEW_POINTS = 2000

@@ -14,6 +14,7 @@ import lipcore
 from lipcore.estimators.base import RobotKind
 from lipcore.files.persistence import checksums, read_manifest
 from lipcore.model.verdict import OPTIONS, VerdictOptions
+from lipcore.vocabulary import COMPONENTS, ENERGY_ESTIMATORS
 from service.contract.models import Model, ModelPage, Promotion, Version, VersionSummary
 from service.contract.verdict import Thresholds
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
@@ -313,7 +314,12 @@ def show_version(database: Database, model: str, version: int) -> Version:
     fields = {name: row.manifest[name] for name in Version.model_fields if name in row.manifest}
     about = {"model": row.model, "version": row.version, "created_at": row.created_at, "job": row.job}
     options = verdict_options(database, [model]).get(model, OPTIONS)
-    return Version(**about, verdict=verdicts.of_version(row.manifest, options), **fields)
+    return Version(
+        **about,
+        components=COMPONENTS if row.manifest["estimator"] in ENERGY_ESTIMATORS else ["friction"],
+        verdict=verdicts.of_version(row.manifest, options),
+        **fields,
+    )
 
 
 def verdict_options(database: Database, models: Collection[str]) -> dict[str, VerdictOptions]:

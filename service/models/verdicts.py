@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from lipcore.data.coverage import clopper_pearson
 from lipcore.data.samples import Array
 from lipcore.model import verdict
 from lipcore.model.verdict import Fault, JudgedFigures, JudgedOn, OutsideFigures, VerdictOptions
+from lipcore.online.record import HALF_WIDTH
+from lipcore.online.window import Window
 from service.contract.datasets import Cause, Remedy
 from service.contract.verdict import LABELS, Verdict
 from service.models import texts
@@ -32,16 +35,26 @@ def options_of(row: ModelRow | None) -> VerdictOptions:
 
 
 def of_version(manifest: Mapping[str, Any], options: VerdictOptions = verdict.OPTIONS) -> Verdict:
-    """Return the verdict on a version by its manifest: by the held-out part of its training.
+    """Return the verdict on a version by its manifest: by the held-out part of its training, or by `judged`.
 
-    The shipped model was judged on other recordings, `judged` in its lineage.
+    `judged` in a lineage has the figures of other rows: of recordings for the shipped model, of streams for a refresh.
     """
-    lineage = manifest["lineage"]
-    record = lineage.get("holdout") or lineage.get("judged") or {}
-    figures = read_figures(record, manifest["joint_names"], manifest["joint_types"])
-    judged_on: JudgedOn = "nothing" if figures is None else "held_out" if lineage.get("holdout") else "recording"
-    repeats = record.get("repeats_training")
+    lineage, figures = manifest["lineage"], figures_of_version(manifest)
+    judged_on: JudgedOn = "nothing"
+    if figures is not None:
+        judged_on = "held_out" if not lineage.get("judged") else "stream" if "refresh" in lineage else "recording"
+    repeats = _judged_record(lineage).get("repeats_training")
     return represent(verdict.judge(figures, judged_on, repeats, faults_of(lineage), options=options))
+
+
+def figures_of_version(manifest: Mapping[str, Any]) -> JudgedFigures | None:
+    """Return the figures behind the verdict on a version; None without figures."""
+    return read_figures(_judged_record(manifest["lineage"]), manifest["joint_names"], manifest["joint_types"])
+
+
+def _judged_record(lineage: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the figures of a lineage that its verdict is based on; empty if there are none."""
+    return lineage.get("judged") or lineage.get("holdout") or {}
 
 
 def of_evaluation(
@@ -63,6 +76,63 @@ def of_evaluation(
     if judged_on != "training":
         faulty = [Fault(text, texts.describe_other_reading(data.id)) for text in find_faults(data)]
     return represent(verdict.judge(figures, judged_on, record.get("repeats_training"), faults, faulty, options))
+
+
+def of_recording(data: DatasetRow) -> Verdict:
+    """Return the best verdict that a version trained on a data set alone can get."""
+    report = data.report
+    rate, excitation = report.get("rate_hz"), report.get("excitation") or {}
+    standstill = excitation.get("standstill")
+    found = verdict.judge_recording(
+        seconds=data.rows / rate if rate else None,
+        moving=None if standstill is None else 1 - standstill,
+        period=excitation.get("period_s"),
+        faults=[Fault(text, texts.describe_correction(data.id)) for text in find_faults(data)],
+    )
+    return represent(found)
+
+
+def of_window(
+    window: Window,
+    now: float,
+    scale: Sequence[float],
+    manifest: Mapping[str, Any],
+    options: VerdictOptions = verdict.OPTIONS,
+) -> Verdict:
+    """Return the verdict on the intervals in responses, by the rows of a window before a Unix time, s.
+
+    Errors of neighbouring rows are correlated, so a bucket of the window, 1 s or longer, is one effective sample.
+    scale: the present factor on the width of the intervals, (n,).
+    """
+    record, spans, held = window.record(now), window.count_spans(now), window.held(now)
+    faults = faults_of(manifest["lineage"])
+    if not record.rows:
+        return represent(verdict.judge(None, "stream", faults=faults))
+    n = record.n_joints
+    coverage = np.array(held.coverage(), np.float64) if held.rows else record.coverage
+    count = np.full(n, float(spans))
+    low, high = clopper_pearson(coverage, count)
+    unknown = np.full(n, np.nan)
+    trained = figures_of_version(manifest)
+    figures = JudgedFigures(
+        joint_names=tuple(manifest["joint_names"]),
+        joint_types=tuple(manifest["joint_types"]),
+        nmse=record.nmse,
+        rmse=record.rmse,
+        torque_noise=np.sqrt(record.noise),
+        coverage=coverage,
+        coverage_low=low,
+        coverage_high=high,
+        independent=count,
+        interval_width=2 * HALF_WIDTH * np.array(scale) * np.sqrt(record.variance + record.noise),
+        torque_range=unknown if trained is None else trained.torque_range,
+        torque_limit=unknown if trained is None else trained.torque_limit,
+        serving_rmse=unknown,
+        outside=None,
+        moving=None,
+        seconds=spans * window.span_s,
+    )
+    return represent(verdict.judge(figures, "stream", faults=faults, options=options))
 
 
 def represent(found: verdict.Verdict) -> Verdict:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.metrics import BlockScores
+from lipcore.data.samples import Samples
 from lipcore.estimators.noise import white
 from lipcore.model.torque_model import TorqueModel
 from service.contract.holdout import Evaluation
@@ -44,6 +45,16 @@ def judged_figures(model: TorqueModel, data: TrainingData) -> dict[str, Any]:
     blocks = {"rows": scores.rows.tolist(), "nlpd": nlpd, "nmse": nmse}
     evaluations = {part.row.id: _evaluation(model, data, part, most) for part in table.parts}
     return {**found, "blocks": blocks, "evaluations": evaluations}
+
+
+def stream_figures(model: TorqueModel, samples: Samples) -> dict[str, Any]:
+    """Return the figures of a fit on rows of streams that it has not learnt, as the `judged` of a lineage."""
+    answer = answer_of(model, samples)
+    return {
+        "torque_noise": np.minimum(white(samples), model.noise_std).tolist(),  # `white` of thinned rows contains motion
+        **range_figures(samples, answer, model.training_range),
+        **figures(model, samples, len(samples), len(samples)),
+    }
 
 
 def _evaluation(model: TorqueModel, data: TrainingData, part: TablePart, most: int) -> dict[str, Any]:

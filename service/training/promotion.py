@@ -23,6 +23,7 @@ from lipcore.model.verdict import OPTIONS, VerdictOptions
 from service.contract.holdout import HoldoutLineage
 from service.contract.models import Promotion
 from service.contract.states import PromotionOption
+from service.contract.verdict import Verdict
 from service.models import aliases, registry, verdicts
 from service.models.lineage import answer_of, learnt_from
 from service.models.texts import describe_verdict
@@ -48,18 +49,24 @@ def judge(
     with database.session() as session:
         number = registry.serving_version(session, model)
         serving = None if number is None else session.get_one(VersionRow, (model, number))
-    options = registry.verdict_options(database, [model]).get(model, OPTIONS)
-    about = {"joint_names": trained.joint_names, "joint_types": trained.joint_types, "lineage": lineage}
     compared = None
     if held_out is not None and serving is not None:
+        options = registry.verdict_options(database, [model])[model]
         compared = _against(files, serving, trained, held_out, lineage, options)
         if compared.rmse is not None:
             lineage["holdout"]["serving"] = {"version": serving.version, "rmse": compared.rmse}
-    verdict = verdicts.of_version(about, options)
+    verdict = verdict_of(database, model, trained, lineage)
     if not verdict.serves:
         return Promotion.of(False, describe_verdict(verdict.label, verdict.reason), number, option)
     reason = verdict.reason if compared is None else f"{verdict.reason} {compared.reason}"
     return Promotion.of(compared is None or compared.serves, reason, number, option)
+
+
+def verdict_of(database: Database, model: str, trained: TorqueModel, lineage: dict[str, Any]) -> Verdict:
+    """Return the verdict on a fit before it is added as a version. lineage: that of the version."""
+    options = registry.verdict_options(database, [model]).get(model, OPTIONS)
+    about = {"joint_names": trained.joint_names, "joint_types": trained.joint_types, "lineage": lineage}
+    return verdicts.of_version(about, options)
 
 
 def settle(session: Session, model: str, judged: Promotion, option: PromotionOption) -> Promotion:

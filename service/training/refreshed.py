@@ -1,4 +1,4 @@
-"""Decide whether a refreshed version replaces the serving version.
+"""Decide whether a refreshed version replaces the serving version: if it is better, and its verdict is usable.
 
 Both predict the newest logged rows, which neither has learnt: the refreshed version is first fitted without them, and
 the serving version is restored to its state before them. The score is the negative log predictive density of a row's
@@ -25,10 +25,13 @@ from service.journal.floor import error_floor_of
 from service.journal.restore import restore
 from service.models import registry
 from service.models.lineage import answer_of
+from service.models.texts import describe_verdict
 from service.storage import audit
 from service.storage.database import Database, LearningRow, VersionRow
 from service.storage.files import Files
 from service.training import texts
+from service.training.judging import stream_figures
+from service.training.promotion import verdict_of
 from service.training.refresh_data import ComparisonRows
 
 
@@ -39,6 +42,28 @@ class RefreshComparison:
     better: bool
     reason: str
     evidence: dict[str, Any]
+
+
+def judge(
+    database: Database,
+    files: Files,
+    serving: VersionRow,
+    trained: TorqueModel,
+    rows: ComparisonRows | None,
+    lineage: dict[str, Any],
+) -> Promotion:
+    """Decide whether the judged fit of a refresh may serve: if it is better than the serving version, and usable.
+
+    Add the comparison, and the figures behind the verdict, to the lineage of its version.
+    """
+    compared = compare(database, files, serving, trained, rows)
+    lineage["refresh"] = {**lineage["refresh"], "compared": compared.reason, "evidence": compared.evidence}
+    if rows is not None and compared.evidence:
+        lineage["judged"] = stream_figures(trained, rows.samples)
+    verdict = verdict_of(database, serving.model, trained, lineage)
+    if compared.better and not verdict.serves:
+        return Promotion.of(False, describe_verdict(verdict.label, verdict.reason), serving.version)
+    return Promotion.of(compared.better, compared.reason, serving.version)
 
 
 def compare(

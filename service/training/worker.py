@@ -183,16 +183,14 @@ def _judged(
     judged_on: Samples | None,
     lineage: dict[str, Any],
 ) -> Promotion:
-    """Return whether the version serves; for a refresh also add its comparison to the lineage."""
+    """Return whether the version serves; add the figures behind that to the lineage."""
     refresh = claim.request.get("refresh")
     if refresh is None:
         option = _option(settings, claim)
         return promotion.judge(database, files, claim.model, trained, judged_on, lineage, option)
     with database.session() as session:
         serving = session.get_one(VersionRow, (claim.model, refresh["version"]))
-    compared = refreshed.compare(database, files, serving, trained, data.unlearnt)
-    lineage["refresh"] = {**lineage["refresh"], "compared": compared.reason, "evidence": compared.evidence}
-    return Promotion.of(compared.better, compared.reason, serving.version)
+    return refreshed.judge(database, files, serving, trained, data.unlearnt, lineage)
 
 
 def _publish(

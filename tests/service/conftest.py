@@ -40,9 +40,9 @@ CONSTANTS = {
     "service.inference.predicting.MAX_BATCH": 20,
     "service.inference.evaluating.MAX_EVALUATION_SAMPLES": 50,
     "service.api.dependencies.MAX_PAGE": 3,
-    "service.training.jobs.MAX_DATASETS": 2,
+    "service.training.requests.MAX_DATASETS": 2,
     "service.training.jobs.MAX_QUEUED": 2,
-    "service.training.jobs.MAX_OPTIONS": {**MAX_OPTIONS, "hyperparameter_samples": 30, "posterior_samples": 40},
+    "service.training.requests.MAX_OPTIONS": {**MAX_OPTIONS, "hyperparameter_samples": 30, "posterior_samples": 40},
 }
 """The same for constants that are read at each request."""
 

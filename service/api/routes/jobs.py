@@ -27,7 +27,7 @@ from service.foundation.errors import (
 from service.models.loaded import LoadedModels
 from service.storage.database import JobRow
 from service.storage.rows import identify_request
-from service.training import jobs
+from service.training import jobs, requests
 from service.training.feed import MAX_FOLLOWERS
 from service.training.queue import JobQueue
 
@@ -106,7 +106,7 @@ def check(queue: JobQueueDep, draft: JobDraft) -> None:
 
     Data sets that are not uploaded yet cannot be checked. The errors are those of `POST /v1/jobs`.
     """
-    jobs.check(queue, draft)
+    requests.check_draft(queue, draft)
 
 
 @router.get("", summary="List jobs, newest first")

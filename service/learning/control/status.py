@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -16,6 +16,7 @@ from lipcore.online.window import Window
 from lipcore.vocabulary import CODES
 from service.contract import learning as schema
 from service.contract.observations import ObservationResponse
+from service.contract.verdict import Verdict
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
 from service.journal import log, snapshots
@@ -23,7 +24,8 @@ from service.journal.arrivals import is_forgotten
 from service.learning import owner
 from service.learning.ingest.observations import read_state
 from service.learning.learners import Learners
-from service.models import registry
+from service.models import registry, verdicts
+from service.models.served import ServedModel
 from service.storage.database import EventRow, StreamRow
 from service.storage.rows import Page
 
@@ -75,7 +77,15 @@ def read_quality(learners: Learners, model: str) -> schema.Quality:
         joint_names=list(served.model.joint_names),
         windows=[summarise_window(each, now) for each in learners.monitor(model).windows],
         scale=served.scales.default_factors,
+        verdict=judge_lately(learners, served, registry.find(learners.database, model, served.version).manifest, now),
     )
+
+
+def judge_lately(learners: Learners, served: ServedModel, manifest: Mapping[str, Any], now: float) -> Verdict:
+    """Return the verdict on the responses of a serving version, by the shortest window before a Unix time, s."""
+    options = registry.verdict_options(learners.database, [served.name])[served.name]
+    window = min(learners.monitor(served.name).windows, key=lambda each: each.seconds)
+    return verdicts.of_window(window, now, served.scales.default_factors, manifest, options)
 
 
 def summarise_window(sums: Window, now: float) -> schema.QualityWindow:

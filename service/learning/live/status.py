@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 from lipcore.vocabulary import CODES
 from service.contract.learning import LiveAnswers, LiveNovelty, LiveStatus
@@ -10,6 +12,8 @@ from service.journal import log
 from service.learning import owner
 from service.learning.control import decisions, payload, status
 from service.learning.learners import Learners
+from service.models import registry
+from service.models.served import ServedModel
 from service.storage.rows import Page
 from service.telemetry.meters import OTHER, Meters, StreamMeter
 
@@ -25,6 +29,7 @@ class StatusReader:
     def __init__(self, learners: Learners, meters: Meters, model: str) -> None:
         self.learners, self.model = learners, model
         self._answers = AnswerCounter(meters, model)
+        self._manifest: tuple[int, Mapping[str, Any]] | None = None
 
     def __call__(self, novel: list[LiveNovelty], passed: float | None) -> LiveStatus:
         """Return the status; raise NotFoundError if the model was deleted. passed: seconds since the last status."""
@@ -56,10 +61,18 @@ class StatusReader:
             counts={name: monitor.counts[name] for name in COUNTS},
             windows=[status.summarise_window(each, now) for each in monitor.windows],
             scale=served.scales.default_factors,
+            verdict=status.judge_lately(learners, served, self._read_manifest(served), now),
             payloads=payload.summarise_payloads(monitor, served),
             answers=self._answers.since(passed),
             alarms=decisions.alarms(learners, model, Page(after=None, limit=MAX_ALARMS)).items,
         )
+
+    def _read_manifest(self, served: ServedModel) -> Mapping[str, Any]:
+        """Return the manifest of the serving version, which is read once."""
+        if self._manifest is None or self._manifest[0] != served.version:
+            row = registry.find(self.learners.database, served.name, served.version)
+            self._manifest = served.version, row.manifest
+        return self._manifest[1]
 
 
 class AnswerCounter:

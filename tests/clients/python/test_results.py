@@ -10,7 +10,7 @@ import pytest
 from lipcore.robots.urdf import RigidBody
 from lipserve.call import Answer
 from lipserve.records.live import LiveLost
-from lipserve.records.models import Verdict
+from lipserve.records.verdicts import Verdict
 from lipserve.results.arm import Arm, Version, read_arm
 from lipserve.results.evaluation import read_evaluation
 from lipserve.results.series import LiveRows, read_live
@@ -183,7 +183,7 @@ REVERSED = JOINTS[::-1]
 def version(parameters, **given) -> Version:
     known = {"model": "m", "version": 1, "created_at": "2026-01-01T00:00:00+00:00", "job": None, "estimator": "lip"}
     known |= {"joint_names": list(REVERSED), "joint_types": ["revolute"] * 7, "torque_convention": "gravity_included"}
-    known |= {"noise_std": [0.1] * 7, "parameters": parameters, "warnings": []}
+    known |= {"noise_std": [0.1] * 7, "parameters": parameters, "warnings": [], "components": []}
     nothing = ("training_range", "options", "fit", "compact", "calibration", "hyperparameters", "lineage")
     known["verdict"] = msgspec.convert(UNJUDGED, Verdict)
     return Version(**{**known, **{name: {} for name in nothing}, **given})

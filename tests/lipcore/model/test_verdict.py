@@ -10,7 +10,16 @@ from lipcore.data.motion import Motion
 from lipcore.data.signals import noise_level
 from lipcore.model import texts
 from lipcore.model.torque_model import training_range
-from lipcore.model.verdict import LEVELS, OPTIONS, Fault, JudgedFigures, OutsideFigures, is_outside, judge
+from lipcore.model.verdict import (
+    LEVELS,
+    OPTIONS,
+    Fault,
+    JudgedFigures,
+    OutsideFigures,
+    is_outside,
+    judge,
+    judge_recording,
+)
 
 OUTSIDE = OutsideFigures(share=0.4, squared=np.array([0.02, 1.5]), coverage=np.array([0.95, 0.93]))
 GOOD = JudgedFigures(
@@ -122,6 +131,31 @@ def test_origin_of_the_samples_counts():
     assert judge(figures_with(nmse=[4.0, 0.2], rmse=[2.0, 1.0]), "training").level == "wrong"
     assert judge(GOOD, "recording", repeats=0.6).reason == texts.describe_repeated(0.6)
     assert judge(GOOD, "recording", repeats=0.4).level == "usable"
+
+
+def test_verdict_on_a_stream_holds_for_its_motion_only():
+    found = judge(replace(GOOD, outside=None), "stream")
+    assert (found.level, found.reason) == ("usable_in_range", texts.ONLY_PRESENT_MOTION)
+    assert judge(GOOD, "stream").level == "usable"
+
+
+@pytest.mark.parametrize(
+    ("recording", "level", "words"),
+    [
+        ((60.0, 0.9, None), "usable", "does not repeat itself"),
+        ((None, None, None), "usable", ""),
+        ((9.9, 1.0, None), "not_judged", "Only 3 s can be judged, at least 3 s are needed"),
+        ((60.0, 0.05, None), "usable_in_range", "stand still"),
+        ((60.0, 1.0, 4.0), "usable_in_range", "repeats itself every 4 s"),
+    ],
+)
+def test_recording_limits_the_verdict(recording, level, words):
+    found = judge_recording(*recording)
+    assert (found.level, found.judged_on, found.joints) == (level, "nothing", ())
+    assert words in found.reason
+    fault = Fault("The torque of hip has the opposite sign.", "Read it again.")
+    wrong = judge_recording(*recording, faults=[fault])
+    assert (wrong.level, wrong.reason, wrong.action) == ("wrong", fault.text, fault.action)
 
 
 def test_fault_of_the_data_outranks_figures():

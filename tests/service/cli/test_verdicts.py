@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lipcore.model.verdict import LEVELS
 from lipserve import StreamClient
 from service.cli.wording import in_shell
 from tests.service.data import error, train, upload
@@ -45,6 +46,29 @@ def test_version_that_is_not_usable_serves_only_by_override(asking, lipserve, na
     code, _, refused = lipserve("models", "promote", model, number, "--url", server.url)
     assert (code, "`--override`" in refused) == (1, True)
     assert server.client.get(f"/v1/models/{model}").json()["serving_version"] == before
+
+
+BEST = {
+    "mirrored-sign": "wrong",
+    "wrong-order": "wrong",
+    "gravity-missing": "wrong",
+    "other-robot": "wrong",
+    "short": "not_judged",
+    "repeated-motion": "usable_in_range",
+    "at-rest-only": "usable_in_range",
+}
+"""Level of the best verdict that a recording allows; `usable` for the other recordings."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_recording_limits_the_verdict_of_its_models(asking, lipserve, name):
+    server, jobs = asking
+    dataset = jobs[name]["datasets"][0]
+    best = server.client.get(f"/v1/datasets/{dataset}").json()["learnability"]
+    assert best["level"] == BEST.get(name, "usable"), best["reason"]
+    assert LEVELS.index(best["level"]) >= LEVELS.index(jobs[name]["verdict"]["level"])
+    code, text, _ = lipserve("data", "show", dataset, "--url", server.url)
+    assert (code, f"can be {best['label']} at best: {in_shell(best['reason'])}" in " ".join(text.split())) == (0, True)
 
 
 def test_recording_of_another_robot_waits_for_approval(asking):

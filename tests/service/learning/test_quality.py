@@ -14,6 +14,7 @@ from lipcore.online.window import Window
 from lipcore.vocabulary import CODES
 from service.learning.control import status
 from service.learning.ingest.monitor import WINDOWS_S
+from service.models import verdicts
 from tests.service.data import eventually
 from tests.service.learning.learning_models import observation_batch
 
@@ -46,6 +47,7 @@ def test_rows_are_predicted_before_they_are_learnt(learning_model):
     assert (seen["model"], seen["version"], seen["revision"], seen["level"]) == (learning_model.name, 1, 3, 0.95)
     assert seen["joint_names"] == ["joint1", "joint2"]
     assert [window["seconds"] for window in seen["windows"]] == list(WINDOWS_S)
+    assert seen["verdict"]["judged_on"] == "stream"
     for window in seen["windows"]:
         assert (window["rows"], window["accepted"], window["rejected"]) == (30, 30, {})
         for name, figures in expected.items():
@@ -65,6 +67,47 @@ def test_quality_windows_slide():
     assert whole.rmse == pytest.approx([math.sqrt((1 + 9) / 2)])
     assert (half.rows, half.rmse, half.nmse) == (4, [3.0], [None])
     assert (none.rows, none.accepted, none.rejected, none.rmse) == (0, 0, {}, [None])
+
+
+MANIFEST = {"joint_names": ["hip", "knee"], "joint_types": ["revolute", "revolute"], "lineage": {}}
+
+
+def fill_window(error, scale=1.0, seconds=60, torque=3.0):
+    """Return a window of rows of two joints with these errors; std and noise_std are 0.3 and 0.4 N·m."""
+    window, rng = Window(60.0, 2), np.random.default_rng(1)
+    for second in range(seconds):
+        mean = torque * rng.standard_normal((100, 2))
+        tau = mean + error * rng.standard_normal((100, 2))
+        window.add(Record.of(tau, mean, np.full((100, 2), 0.3), np.full(2, 0.4), scale), {}, 1000.5 + second)
+    return window
+
+
+@pytest.mark.parametrize(
+    ("window", "level", "words"),
+    [
+        (fill_window([0.5, 0.5]), "usable_in_range", "predicts the present motion"),
+        (fill_window([0.5, 5.0], torque=1.5), "wrong", "knee 5"),
+        (fill_window([0.5, 1.0]), "wrong", "too narrow: knee 67 %"),
+        (fill_window([0.5, 0.5], torque=0.05), "not_judged", "not larger than its noise"),
+        (fill_window([0.5, 0.5], seconds=2), "not_judged", ""),
+        (Window(60.0, 2), "not_judged", ""),
+    ],
+    ids=["good", "error", "narrow", "at rest", "short", "empty"],
+)
+def test_latest_rows_decide_the_verdict_on_the_responses(window, level, words):
+    found = verdicts.of_window(window, 1060.0, [1.0, 1.0], MANIFEST)
+    assert (found.level, found.judged_on) == (level, "stream" if found.joints else "nothing")
+    assert words in found.reason, found.reason
+    faulty = {**MANIFEST, "lineage": {"datasets": [{"id": "ds_1", "faults": ["The torque of hip is mirrored."]}]}}
+    assert verdicts.of_window(window, 1060.0, [1.0, 1.0], faulty).level == "wrong"
+
+
+def test_scale_of_the_intervals_counts_for_the_verdict():
+    width = 2 * 1.96 * 0.5
+    for scale in (1.0, 3.0):
+        joints = verdicts.of_window(fill_window([0.5, 0.5]), 1060.0, [scale, scale], MANIFEST).joints
+        assert [each.interval_width for each in joints] == pytest.approx([scale * width] * 2, rel=1e-3)
+        assert [each.effective_samples for each in joints] == [60, 60]
 
 
 def scrape_metrics(learning_service, model):

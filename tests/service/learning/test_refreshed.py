@@ -7,7 +7,8 @@ import pytest
 
 from lipcore.data.samples import Samples
 from lipcore.online.learner import OnlineModel
-from service.models import registry
+from service.contract.verdict import Thresholds
+from service.models import registry, verdicts
 from service.training import refresh_data, refreshed
 from service.training.refresh_data import ComparisonRows
 from tests.service.learning.pendulums import ARM, Arm, make_rows, trained_model
@@ -35,11 +36,16 @@ def make_comparison_rows(*numbers: int) -> ComparisonRows:
     return ComparisonRows(TRAINED_EVENTS, samples)
 
 
-def learn_seconds(seconds: int):
+ERRORS = np.array([0.1, 0.15])
+"""Errors of the model after 14 s, N·m: the friction is not linear, as the model takes it to be."""
+
+
+def learn_seconds(seconds: int, floor=None):
+    """Return the model that has learnt these seconds. floor: variance of its errors, (N·m)², (n,)."""
     online = OnlineModel.start(trained_model())
     for number in range(seconds):
         online = online.learn(make_rows(number, SECOND_ROWS))
-    return online.model()
+    return online.model(floor)
 
 
 def compare_model(arm, seconds, rows):
@@ -63,6 +69,22 @@ def test_candidate_is_accepted_if_it_predicts_newest_rows_better(arm, seconds, p
     better = found.evidence["gain"] > 2 * found.evidence["standard_error"]
     assert better == passed
     assert set(found.evidence["figures"]) == {"serving", "candidate"}
+
+
+@pytest.mark.parametrize(("seconds", "max_error", "level"), [(14, 0.9, "usable"), (14, 1e-9, "wrong"), (0, 0.9, "")])
+def test_refresh_serves_if_it_is_better_and_usable(arm, seconds, max_error, level):
+    registry.set_thresholds(arm.database, ARM, Thresholds(max_error=max_error))
+    serving, lineage = registry.find(arm.database, ARM, 1), {"refresh": {"version": 1}}
+    rows = make_comparison_rows(*range(TRAINED_EVENTS, 26))
+    trained = learn_seconds(seconds, ERRORS**2 if seconds else None)
+    decided = refreshed.judge(arm.database, arm.files, serving, trained, rows, lineage)
+    shown = verdicts.of_version(
+        {**serving.manifest, "lineage": lineage}, registry.verdict_options(arm.database, [ARM])[ARM]
+    )
+    assert (shown.judged_on, lineage["judged"]["of"]) == ("stream", 22 * SECOND_ROWS)
+    assert shown.level.startswith(level)
+    assert decided.answers == (level == "usable")
+    assert shown.reason in decided.reason if level == "wrong" else "version 1" in decided.reason
 
 
 def test_too_few_rows_give_no_verdict(arm):

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from msgspec import field
 
 from lipserve.records import Record
+from lipserve.records.verdicts import Verdict
 
 
 class Gap(Record, frozen=True, kw_only=True):
@@ -315,6 +316,7 @@ class Dataset(Record, frozen=True, kw_only=True):
     """An immutable, validated table of samples.
 
     sha256: Hash of the stored samples
+    learnability: Best verdict that a version trained on it alone can get
     """
 
     id: str
@@ -323,4 +325,5 @@ class Dataset(Record, frozen=True, kw_only=True):
     sha256: str
     joint_names: list[str]
     torque_convention: Literal["gravity_included", "gravity_compensated"]
+    learnability: Verdict
     report: DatasetReport

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from lipserve.records import Record
-from lipserve.records.models import Verdict
+from lipserve.records.verdicts import Verdict
 
 
 class Holdout(Record, frozen=True, kw_only=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from lipserve.records import Record
+from lipserve.records.verdicts import Verdict
 
 
 class RolledBack(Record, frozen=True, kw_only=True):
@@ -51,6 +52,7 @@ class Quality(Record, frozen=True, kw_only=True):
     revision: Serving revision
     level: Probability of the interval
     scale: Per joint, the present factor on the half width of intervals
+    verdict: Verdict on the intervals in responses, by the shortest window
     """
 
     model: str
@@ -60,6 +62,7 @@ class Quality(Record, frozen=True, kw_only=True):
     level: float = 0.95
     windows: list[QualityWindow]
     scale: list[float]
+    verdict: Verdict
 
 
 class LearningOptions(Record, frozen=True, kw_only=True):

@@ -7,6 +7,7 @@ from typing import Literal
 from lipserve.records import Record
 from lipserve.records.learning import Alarm, Held, QualityWindow
 from lipserve.records.payloads import Scalar
+from lipserve.records.verdicts import Verdict
 
 
 class LiveNovelty(Record, frozen=True, kw_only=True):
@@ -78,6 +79,7 @@ class LiveStatus(Record, frozen=True, kw_only=True):
     level: Probability of the interval
     windows: Prediction quality over sliding windows
     scale: Per joint, the present factor on the half width of intervals
+    verdict: Verdict on the intervals in responses, by the shortest window
     payloads: Payload of each stream; null without arm geometry
     answers: Null at first, and if the service has too many models to count them separately
     alarms: Latest alarms, newest first
@@ -104,6 +106,7 @@ class LiveStatus(Record, frozen=True, kw_only=True):
     level: float = 0.95
     windows: list[QualityWindow]
     scale: list[float]
+    verdict: Verdict
     payloads: list[LivePayload] | None
     answers: LiveAnswers | None
     alarms: list[Alarm]

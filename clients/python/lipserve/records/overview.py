@@ -7,7 +7,7 @@ from typing import Literal
 from lipserve.records import Record
 from lipserve.records.learning import Alarm
 from lipserve.records.live import LivePayload
-from lipserve.records.models import Verdict
+from lipserve.records.verdicts import Verdict
 
 
 class SketchedJoint(Record, frozen=True, kw_only=True):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lipserve.records.models import Verdict
+from lipserve.records.verdicts import Verdict
 from lipserve.results import Array, Plain, figure, html_table, reading, text_table
 from lipserve.states import Outcome
 from lipserve.wording import percent

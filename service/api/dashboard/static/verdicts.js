@@ -17,9 +17,9 @@ export function JointBadge({ joint: { level } }) {
   return html`<${Badge} state=${level.replaceAll("_", " ")} kind=${KINDS[level]} />`;
 }
 
-/** A note with the level of a verdict, why, and what to do. */
-export function VerdictNote({ verdict }) {
-  return html`<p class=${verdict.serves ? "verdict" : "verdict banner"} role="note"><${VerdictBadge} verdict=${verdict} /> <${Prose} text=${verdict.reason} /> <span class="muted">${verdict.action}</span></p>`;
+/** A note with the level of a verdict, why, and what to do. about: text before the level. */
+export function VerdictNote({ verdict, about = "" }) {
+  return html`<p class=${verdict.serves ? "verdict" : "verdict banner"} role="note">${about} <${VerdictBadge} verdict=${verdict} /> <${Prose} text=${verdict.reason} /> <span class="muted">${verdict.action}</span></p>`;
 }
 
 /** Explanation of the columns, shown below a list. */

@@ -10,6 +10,7 @@ import { Warnings } from "./data/findings.js";
 import { Recommendations, Summary } from "./data/report.js";
 import { rowsOf } from "./data/rows.js";
 import { Signals } from "./data/signals.js";
+import { VerdictNote } from "../verdicts.js";
 
 const TABS = [
   ["signals", "Signals"],
@@ -51,6 +52,7 @@ function View({ dataset, query }) {
   return html`
     <${Heading} text=${name}><${Link} kind="primary" to=${`#/train?${new URLSearchParams({ datasets: id, ...held })}`}>Train on this recording<//><${Button} kind="danger" onclick=${remove}>Delete<//><//>
     <${Summary} dataset=${dataset} />
+    <${VerdictNote} verdict=${dataset.learnability} about="A model of this recording can at best be" />
     <${Warnings} texts=${report.warnings} />
     ${kept && html`<${Corrections} dataset=${dataset} again=${again} />`}
     <${Recommendations} dataset=${dataset} />

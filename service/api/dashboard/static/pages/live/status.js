@@ -4,6 +4,7 @@ import { Badge, Card, Facts, Table } from "../../components.js";
 import { count, counted, number, percent, seconds, sentence, shortNames, torqueUnit } from "../../format.js";
 import { html } from "../../preact.js";
 import { codeLabel } from "./codes.js";
+import { VerdictNote } from "../../verdicts.js";
 import { Explanation } from "./explanation.js";
 
 /** The state of learning and the counts of rows by code. */
@@ -29,7 +30,7 @@ export function Learning({ status }) {
 }
 
 /** Errors and coverage of the last minute by joint. verdict: on the serving version, which knows the range of its torque; may be undefined. */
-export function Quality({ status: { windows: [latest], joint_names: names, joint_types: types, level, scale }, verdict }) {
+export function Quality({ status: { windows: [latest], joint_names: names, joint_types: types, level, scale, verdict: lately }, verdict }) {
   if (!latest.rows) return html`<${Card} title="Quality"><p class="muted">No measured torque in the last ${span(latest.seconds)}.</p><//>`;
   const short = shortNames(names);
   const share = (joint) => {
@@ -45,6 +46,7 @@ export function Quality({ status: { windows: [latest], joint_names: names, joint
     { label: "factor", numeric: true, cell: (joint) => `×\u00a0${number(scale[joint], 2)}` },
   ];
   return html`<${Card} title="Quality">
+    <${VerdictNote} verdict=${lately} />
     <${Table} columns=${columns} rows=${names.map((_name, joint) => joint)} caption=${`${count(latest.rows)} rows of the last ${span(latest.seconds)}, predicted before they were learnt`} />
     <${Explanation}>Of range: RMSE as a share of the range of the torque in training. Coverage is that of the model’s own intervals, served that of the intervals in responses. These are scaled by the factor. It adapts to recent errors, also at rest and during contacts, so that coverage reaches ${percent(level, 0)}.<//>
   <//>`;

@@ -1,10 +1,10 @@
-// Components of a torque: which an estimator offers, their names and colours.
+// Components of a torque: which a version offers, their names and colours.
 
 const NAMES = { inertial: "inertial, M(q) ddq", coriolis: "Coriolis and centrifugal", gravity: "gravity", friction: "friction" };
 
-/** Return the components that an estimator offers: all if it learns energies or rigid bodies, else friction. */
-export function offered({ estimator }) {
-  return /^(lip|rigid-body)/.test(estimator) ? Object.keys(NAMES) : ["friction"];
+/** Return the torque components that a version offers. */
+export function offered({ components }) {
+  return Object.keys(NAMES).filter((name) => components.includes(name));
 }
 
 /** Return the label of a component. */

@@ -3,6 +3,7 @@
 import { Link, Listing } from "../../components.js";
 import { ago, count, counted, seconds, when } from "../../format.js";
 import { html } from "../../preact.js";
+import { VerdictBadge } from "../../verdicts.js";
 
 /** Checkboxes of data sets. first: ids at the top; chosen: ids; onchange(ids). A recording that cannot be added tells why. */
 export function Recordings({ datasets, first, chosen, onchange }) {
@@ -15,6 +16,7 @@ export function Recordings({ datasets, first, chosen, onchange }) {
   const columns = [
     { label: "Use", cell: box },
     { label: "Recording", value: (row) => row.name, cell: name },
+    { label: "Best verdict", value: (row) => row.learnability.label, cell: (row) => html`<${VerdictBadge} verdict=${row.learnability} />` },
     { label: "Robot", value: (row) => row.report.robot, cell: (row) => row.report.robot ?? "–" },
     { label: "Samples", numeric: true, value: (row) => row.report.rows, first: "descending", cell: (row) => count(row.report.rows) },
     { label: "Length", numeric: true, value: (row) => row.report.timing.duration_s, first: "descending", cell: (row) => seconds(row.report.timing.duration_s) },
