@@ -51,15 +51,19 @@ class ScaleRecord:
 
 @dataclass(frozen=True)
 class IntervalCoverage:
-    """Coverage of the 95 % intervals that were returned: `inside`, (n,), of `rows` measurements. Two add up."""
+    """Coverage of the 95 % intervals that were returned. Two add up."""
 
     rows: int
+    """Number of measurements."""
     inside: Array
+    """Number of measurements inside, (n,)."""
+    factors: Array
+    """Sum of the factors on the half widths, (n,)."""
 
     @staticmethod
     def none(n: int) -> IntervalCoverage:
         """Return the coverage of no rows of n joints."""
-        return IntervalCoverage(0, np.zeros(n))
+        return IntervalCoverage(0, np.zeros(n), np.zeros(n))
 
     @staticmethod
     def of(state: AdaptiveScale, seen: IntervalScores) -> IntervalCoverage:
@@ -67,24 +71,25 @@ class IntervalCoverage:
 
         Every measurement counts: contacts, rows that await a decision, and rows at rest.
         """
-        rows, off = len(seen.score), outside(seen.score, applied_factor(state, seen)).sum(axis=0)
-        return IntervalCoverage(rows, rows - off)
+        rows, factor = len(seen.score), np.broadcast_to(applied_factor(state, seen), seen.score.shape)
+        return IntervalCoverage(rows, rows - outside(seen.score, factor).sum(axis=0), factor.sum(axis=0))
 
     def __add__(self, other: IntervalCoverage) -> IntervalCoverage:
-        return IntervalCoverage(self.rows + other.rows, self.inside + other.inside)
+        return IntervalCoverage(self.rows + other.rows, self.inside + other.inside, self.factors + other.factors)
 
     def coverage(self) -> list[float | None]:
         """Return the share of measurements inside, per joint; None without rows."""
         return [number / self.rows if self.rows else None for number in self.inside.tolist()]
 
     def to_json(self) -> dict[str, Any]:
-        """Return both fields for JSON."""
-        return {"rows": self.rows, "inside": self.inside.tolist()}
+        """Return all fields for JSON."""
+        return {"rows": self.rows, "inside": self.inside.tolist(), "factors": self.factors.tolist()}
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> IntervalCoverage:
-        """Read what `to_json` returned."""
-        return IntervalCoverage(values["rows"], np.array(values["inside"], np.float64))
+        """Read what `to_json` returned, or an earlier release without `factors`: its factors count as 1."""
+        rows, inside = values["rows"], np.array(values["inside"], np.float64)
+        return IntervalCoverage(rows, inside, np.array(values.get("factors", [float(rows)] * len(inside)), np.float64))
 
 
 def applied_factor(state: AdaptiveScale, seen: IntervalScores) -> Array:

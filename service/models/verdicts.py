@@ -95,21 +95,21 @@ def of_recording(data: DatasetRow) -> Verdict:
 def of_window(
     window: Window,
     now: float,
-    scale: Sequence[float],
     manifest: Mapping[str, Any],
     options: VerdictOptions = verdict.OPTIONS,
 ) -> Verdict:
     """Return the verdict on the intervals in responses, by the rows of a window before a Unix time, s.
 
     Errors of neighbouring rows are correlated, so a bucket of the window, 1 s or longer, is one effective sample.
-    scale: the present factor on the width of the intervals, (n,).
     """
     record, spans, held = window.record(now), window.count_spans(now), window.held(now)
     faults = faults_of(manifest["lineage"])
     if not record.rows:
         return represent(verdict.judge(None, "stream", faults=faults))
     n = record.n_joints
-    coverage = np.array(held.coverage(), np.float64) if held.rows else record.coverage
+    coverage, factor = (
+        (held.inside / held.rows, held.factors / held.rows) if held.rows else (record.coverage, np.ones(n))
+    )
     count = np.full(n, float(spans))
     low, high = clopper_pearson(coverage, count)
     unknown = np.full(n, np.nan)
@@ -124,7 +124,7 @@ def of_window(
         coverage_low=low,
         coverage_high=high,
         independent=count,
-        interval_width=2 * HALF_WIDTH * np.array(scale) * np.sqrt(record.variance + record.noise),
+        interval_width=2 * HALF_WIDTH * factor * np.sqrt(record.variance + record.noise),
         torque_range=unknown if trained is None else trained.torque_range,
         torque_limit=unknown if trained is None else trained.torque_limit,
         serving_rmse=unknown,

@@ -85,7 +85,7 @@ def judge_lately(learners: Learners, served: ServedModel, manifest: Mapping[str,
     """Return the verdict on the responses of a serving version, by the shortest window before a Unix time, s."""
     options = registry.verdict_options(learners.database, [served.name])[served.name]
     window = min(learners.monitor(served.name).windows, key=lambda each: each.seconds)
-    return verdicts.of_window(window, now, served.scales.default_factors, manifest, options)
+    return verdicts.of_window(window, now, manifest, options)
 
 
 def summarise_window(sums: Window, now: float) -> schema.QualityWindow:

@@ -10,6 +10,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse
 
 from lipcore.online.record import Record
+from lipcore.online.scale import IntervalCoverage
 from lipcore.online.window import Window
 from lipcore.vocabulary import CODES
 from service.learning.control import status
@@ -72,13 +73,13 @@ def test_quality_windows_slide():
 MANIFEST = {"joint_names": ["hip", "knee"], "joint_types": ["revolute", "revolute"], "lineage": {}}
 
 
-def fill_window(error, scale=1.0, seconds=60, torque=3.0):
+def fill_window(error, seconds=60, torque=3.0):
     """Return a window of rows of two joints with these errors; std and noise_std are 0.3 and 0.4 N·m."""
     window, rng = Window(60.0, 2), np.random.default_rng(1)
     for second in range(seconds):
         mean = torque * rng.standard_normal((100, 2))
         tau = mean + error * rng.standard_normal((100, 2))
-        window.add(Record.of(tau, mean, np.full((100, 2), 0.3), np.full(2, 0.4), scale), {}, 1000.5 + second)
+        window.add(Record.of(tau, mean, np.full((100, 2), 0.3), np.full(2, 0.4)), {}, 1000.5 + second)
     return window
 
 
@@ -95,19 +96,23 @@ def fill_window(error, scale=1.0, seconds=60, torque=3.0):
     ids=["good", "error", "narrow", "at rest", "short", "empty"],
 )
 def test_latest_rows_decide_the_verdict_on_the_responses(window, level, words):
-    found = verdicts.of_window(window, 1060.0, [1.0, 1.0], MANIFEST)
+    found = verdicts.of_window(window, 1060.0, MANIFEST)
     assert (found.level, found.judged_on) == (level, "stream" if found.joints else "nothing")
     assert words in found.reason, found.reason
     faulty = {**MANIFEST, "lineage": {"datasets": [{"id": "ds_1", "faults": ["The torque of hip is mirrored."]}]}}
-    assert verdicts.of_window(window, 1060.0, [1.0, 1.0], faulty).level == "wrong"
+    assert verdicts.of_window(window, 1060.0, faulty).level == "wrong"
 
 
 def test_scale_of_the_intervals_counts_for_the_verdict():
-    width = 2 * 1.96 * 0.5
-    for scale in (1.0, 3.0):
-        joints = verdicts.of_window(fill_window([0.5, 0.5]), 1060.0, [scale, scale], MANIFEST).joints
-        assert [each.interval_width for each in joints] == pytest.approx([scale * width] * 2, rel=1e-3)
-        assert [each.effective_samples for each in joints] == [60, 60]
+    window = Window(60.0, 2)
+    for second in range(60):
+        answered = IntervalCoverage(100, np.array([95.0, 60.0]), np.array([100.0, 300.0]))
+        record = Record.of(np.eye(2), np.zeros((2, 2)), np.full((2, 2), 0.3), np.full(2, 0.4))
+        window.add(record, {}, 1000.5 + second, IntervalCoverage.from_json(answered.to_json()))
+    joints = verdicts.of_window(window, 1060.0, MANIFEST).joints
+    assert [each.coverage for each in joints] == pytest.approx([0.95, 0.6])
+    assert [each.interval_width for each in joints] == pytest.approx([1.96, 3 * 1.96], rel=1e-3)
+    assert [each.effective_samples for each in joints] == [60, 60]
 
 
 def scrape_metrics(learning_service, model):
