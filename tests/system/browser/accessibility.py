@@ -23,6 +23,17 @@ def audit(page: Page) -> list[str]:
     return page.evaluate(AUDIT)
 
 
+BOXES = (Path(__file__).parent / "boxes.js").read_text()
+OPEN_DETAILS = "for (const each of document.querySelectorAll('main details')) each.open = true"
+
+
+def layout_problems(page: Page) -> list[str]:
+    """Return the texts and controls that overlap, are cut or leave their card, with all details closed, then open."""
+    closed = page.evaluate(BOXES)
+    page.evaluate(OPEN_DETAILS)
+    return list(dict.fromkeys([*closed, *page.evaluate(BOXES)]))
+
+
 FOCUSED = (Path(__file__).parent / "focused.js").read_text()
 
 

@@ -9,6 +9,8 @@ import numpy as np
 
 from lipserve import StreamClient
 
+TIMEOUT_S = 60.0
+"""Timeout of an answer: the machine may be busy with other tests."""
 Row = Sequence[np.ndarray]
 """q, dq, ddq and tau, (n,) each."""
 
@@ -23,7 +25,7 @@ def playing(url: str, model: str, rows: Iterable[Row], rate: float) -> Iterator[
 
     def play() -> None:
         try:
-            with StreamClient(model, url, stream_id="cell") as client:
+            with StreamClient(model, url, stream_id="cell", timeout=TIMEOUT_S) as client:
                 begin = time.monotonic()
                 for number, (q, dq, ddq, tau) in enumerate(rows):
                     client.predict(q, dq, ddq, tau=tau)
@@ -39,4 +41,4 @@ def playing(url: str, model: str, rows: Iterable[Row], rate: float) -> Iterator[
     finally:
         stop.set()
         thread.join()
-    assert failures == []
+    assert failures == [], failures

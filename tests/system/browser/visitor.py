@@ -19,6 +19,8 @@ DESKTOP = (1280, 800)
 PHONE = (390, 844)
 MAX_SHOT_BYTES = 250_000
 """Max size of a screenshot, bytes."""
+UNDRAWN = "main :is(.plot, .strip):visible:not(:has(.main-svg)), main .objective:empty, main .arm:empty"
+"""Places of plots that are not drawn yet."""
 SLOW = ("Canvas2D: Multiple readback operations", "GPU stall due to ReadPixels")
 """Warnings of the browser about slow 3-D drawing without a graphics card."""
 _REFUSED = "Failed to load resource: the server responded with a status of "
@@ -74,6 +76,13 @@ class Visitor:
         self.page.evaluate("new Promise((done) => setTimeout(done))")  # a changed hash takes effect a moment later
         self.page.locator("main").locator("h1, .error, .empty").first.wait_for()
         expect(self.page.locator("main .loading")).to_have_count(0)
+        return self.page
+
+    def drawn(self) -> Page:
+        """Wait until the page and all plots of it are drawn."""
+        from tests.system.browser.accessibility import expect
+
+        expect(self.settled().locator(UNDRAWN)).to_have_count(0)
         return self.page
 
     def until(self, look: Callable[[], Any]) -> Any:

@@ -109,8 +109,9 @@ export function Field({ label, hint, kind = "", input }) {
 /** A select with a label. options: [[value, label, disabled reason], …] or texts. */
 export function Choice({ label, hint, options, value, onchange }) {
   const pairs = options.map((option) => (Array.isArray(option) ? option : [option, option]));
+  const title = pairs.find(([each]) => each === value)?.[1]; // a narrow select cuts it
   const made = ([each, text, why]) => html`<option value=${each} selected=${each === value} disabled=${Boolean(why)}>${why ? `${text} (${why})` : text}</option>`;
-  return html`<${Field} label=${label} hint=${hint} input=${(attributes) => html`<select ...${attributes} value=${value} onChange=${(event) => onchange(event.target.value)}>${pairs.map(made)}</select>`} />`;
+  return html`<${Field} label=${label} hint=${hint} input=${(attributes) => html`<select ...${attributes} title=${title} value=${value} onChange=${(event) => onchange(event.target.value)}>${pairs.map(made)}</select>`} />`;
 }
 
 /** A progress bar; fraction: 0 to 1. */
@@ -201,7 +202,7 @@ export function Tabs({ label, options, chosen, onchoose, children }) {
 }
 
 /** A place for code that draws by itself, such as a plot: `draw(element, signal)` runs again whenever `inputs` change. */
-export function Drawn({ draw, inputs, kind = "" }) {
+export function Drawn({ draw, inputs, kind = "plot" }) {
   const place = useRef(null), [error, setError] = useState(null);
   useEffect(() => {
     const stop = new AbortController();

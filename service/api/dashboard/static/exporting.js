@@ -7,6 +7,7 @@ import { html, useRef } from "./preact.js";
 
 const SCALE = 2; // pixels of the picture per CSS pixel
 const NAME_SIZE = 11; // of the names that the page writes over plots
+const KEYS = ".key > span, .joint-plots .joint"; // names beside their colours, which the page writes around plots
 const FONT = "system-ui, sans-serif"; // a picture does not inherit the page's font
 
 /**
@@ -31,11 +32,12 @@ export function csv(rows) {
   return `${rows.map((row) => row.map(cell).join(",")).join("\r\n")}\r\n`;
 }
 
-/** Draw all plots of an element, placed as on the page, and return the PNG. */
+/** Draw all plots of an element with their keys, placed as on the page, and return the PNG. */
 async function pictureOf(element) {
   const plots = [...element.querySelectorAll(".js-plotly-plot")].filter((each) => each.checkVisibility());
   if (!plots.length) throw new Error("There is no plot to save yet.");
-  const boxes = plots.map((each) => each.getBoundingClientRect());
+  const keys = [...element.querySelectorAll(KEYS)].filter((each) => each.checkVisibility());
+  const boxes = [...plots, ...keys].map((each) => each.getBoundingClientRect());
   const left = Math.min(...boxes.map((each) => each.left)), top = Math.min(...boxes.map((each) => each.top));
   const canvas = document.createElement("canvas");
   canvas.width = SCALE * (Math.max(...boxes.map((each) => each.right)) - left);
@@ -47,7 +49,25 @@ async function pictureOf(element) {
     const { width, height, x, y } = boxes[index];
     paper.drawImage(await drawing(plot, width, height), SCALE * (x - left), SCALE * (y - top));
   }
+  for (const [index, key] of keys.entries()) drawKey(paper, key, boxes[plots.length + index], left, top);
   return new Promise((resolve, reject) => canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("The plots are too large for one picture."))), "image/png"));
+}
+
+/** Draw a name and its colour at its place on the page. */
+function drawKey(paper, key, { x, y, height }, left, top) {
+  const sample = key.querySelector(".sample");
+  const size = parseFloat(getComputedStyle(key).fontSize), middle = y - top + height / 2;
+  paper.save();
+  paper.scale(SCALE, SCALE);
+  paper.fillStyle = sample ? getComputedStyle(sample).backgroundColor : getComputedStyle(key, "::before").backgroundColor;
+  paper.globalAlpha = sample ? Number(getComputedStyle(sample).opacity) : 1;
+  paper.fillRect(x - left, middle - size / 3, size, 0.66 * size);
+  paper.globalAlpha = 1;
+  paper.fillStyle = css("text");
+  paper.font = `${size}px ${FONT}`;
+  paper.textBaseline = "middle";
+  paper.fillText(key.textContent, x - left + 1.4 * size, middle);
+  paper.restore();
 }
 
 /** Return an image of one plot, with the names that the page writes over it: `layout.meta`, [{text, x, y}]. */

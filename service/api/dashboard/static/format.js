@@ -1,6 +1,7 @@
 // Formats numbers, times and sizes for people.
 
 const UNKNOWN = "–";
+const MAX_TIME_S = 1e6;
 const isKnown = (x) => x !== null && x !== undefined && Number.isFinite(x);
 
 /** Format a number with significant digits: 0.0123, 12.3, 1.2e-7. */
@@ -62,6 +63,11 @@ export function ago(time) {
 export function when(time) {
   const at = date(time);
   return Number.isNaN(at.getTime()) ? UNKNOWN : at.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
+}
+
+/** Return the time from which plots count: 0, or the first time if it is of a clock, whose digits do not fit the axis. */
+export function timeOrigin(first) {
+  return Math.abs(first) > MAX_TIME_S ? first : 0;
 }
 
 /** Format a payload: 1.48 ± 0.03 kg, 1.498 ± 0.004 kg. mass: {mean, std}; null: none. */

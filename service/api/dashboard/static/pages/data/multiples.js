@@ -8,6 +8,7 @@ import { useEffect, useRef } from "../../preact.js";
 /** Quantities in the order of the columns, and their names. */
 export const QUANTITIES = [["q", "Position"], ["dq", "Velocity"], ["ddq", "Acceleration"], ["tau", "Torque"]];
 const NAME_HEIGHT = 24, GAP = 8, BELOW = 24; // px above, below, and of the axis
+const LEFT = 46, CHARACTER = 8; // px: least margin for the labels, width of a character
 const MIDDLE = [0.25, 0.75]; // where the label of zero fits between those of the ends
 
 /**
@@ -55,13 +56,14 @@ function layoutOf(signals, quantity, joints, axis) {
   const row = signals.rowHeight(joints.length), height = row * joints.length;
   const domain = (index) => [1 - ((index + 1) * row - GAP) / height, 1 - (index * row + NAME_HEIGHT) / height];
   const axes = joints.map((_joint, index) => [axisName("yaxis", index), { domain: domain(index), automargin: false, fixedrange: true, zeroline: false, ...ends(signals.column(quantity, joints[index])) }]);
+  const longest = Math.max(0, ...axes.flatMap(([, { ticktext = [] }]) => ticktext.map((each) => each.length)));
   return {
     ...Object.fromEntries(axes),
     height: height + BELOW,
     showlegend: false, // each plot has its name above it
     hovermode: false,
     dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
-    margin: { l: 46, r: 6, t: 0, b: BELOW },
+    margin: { l: Math.max(LEFT, CHARACTER * longest + 4), r: 6, t: 0, b: BELOW },
     xaxis: { automargin: false, nticks: 5, anchor: axisName("y", joints.length - 1), ticksuffix: axis === "t" ? " s" : "" },
     uirevision: axis, // keeps the zoom when the joint changes
     meta: joints.map((joint, index) => ({ text: `${signals.names[joint]}: ${quantity}, ${signals.unit(quantity, joint) || signals.units(quantity)}`, x: 0, y: domain(index)[1] })),

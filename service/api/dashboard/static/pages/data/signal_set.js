@@ -1,7 +1,7 @@
 // Samples of a recording as the plots need them: by quantity and joint, with units.
 
 import { jointVar } from "../../colours.js";
-import { count, number, shortNames } from "../../format.js";
+import { count, number, shortNames, timeOrigin } from "../../format.js";
 import { nearest } from "./rows.js";
 
 const FEW = 2; // joints that have room for higher plots
@@ -12,11 +12,12 @@ export class SignalSet {
   #columns;
 
   constructor(preview, { joint_names: joints, report }) {
-    this.preview = preview;
+    this.origin = timeOrigin(preview.columns[0].t[0]); // of the times below
+    this.preview = { ...preview, columns: preview.columns.map((each) => ({ ...each, t: each.t.map((time) => time - this.origin) })) };
     this.joints = joints;
     this.names = shortNames(joints);
     this.types = report.joint_types;
-    this.#columns = new Map(preview.columns.map((each) => [`${each.quantity} ${each.joint}`, each]));
+    this.#columns = new Map(this.preview.columns.map((each) => [`${each.quantity} ${each.joint}`, each]));
     // the time of each episode may start again: plots over time would overlap
     this.timed = preview.columns.every(({ t }) => t.every((value, index) => index === 0 || value >= t[index - 1]));
   }
@@ -72,7 +73,7 @@ export class SignalSet {
   /** Return the drawn points as a table. */
   table(joints) {
     const points = this.preview.columns.filter((each) => joints.includes(this.joints.indexOf(each.joint)));
-    const rows = points.flatMap((each) => each.rows.map((row, index) => [each.joint, each.quantity, this.unit(each.quantity, this.joints.indexOf(each.joint)) || each.unit, row, each.t[index], each.values[index]]));
+    const rows = points.flatMap((each) => each.rows.map((row, index) => [each.joint, each.quantity, this.unit(each.quantity, this.joints.indexOf(each.joint)) || each.unit, row, each.t[index] + this.origin, each.values[index]]));
     return [["joint", "quantity", "unit", "sample", "time, s", "value"], ...rows];
   }
 

@@ -20,8 +20,8 @@ export function Signals({ dataset, rows, choose }) {
   return html`<${Card} title="Signals"><${Await} reading=${preview} what="Loading the signals">${(found) => html`<${View} preview=${found} dataset=${dataset} rows=${rows} choose=${choose} />`}<//><//>`;
 }
 
-function View({ preview, dataset, rows, choose }) {
-  const signals = useMemo(() => new SignalSet(preview, dataset), [preview]);
+function View({ preview: read, dataset, rows, choose }) {
+  const signals = useMemo(() => new SignalSet(read, dataset), [read]), { preview } = signals;
   const [joint, setJoint] = useState(ALL), [axis, setAxis] = useState(signals.timed ? "t" : "rows"), [drag, setDrag] = useState("zoom");
   const rising = signals.timed || axis === "rows";
   const first = rising ? preview.columns[0][axis][0] : null;

@@ -25,9 +25,10 @@ export function Torque({ shown, joints, types, window, scores, largest, picked, 
   const one = (name, joint) => html`<div key=${name} class=${kinds(joint)} style=${{ "--own": jointVar(joint), "--of": Math.min(scores[joint] / FULL_BAR_STD, 1) }}>
     <div class="head">
       <button type="button" class="joint" aria-pressed=${String(joint === picked)} aria-label=${`Show ${name} large`} onClick=${() => pick(joint)}>${short[joint]}</button>
+      <span class="muted">${torqueUnit(types[joint])}</span>
       <span class="value">${value(joint)}</span>
     </div>
-    <${Plot} shown=${shown} joint=${joint} unit=${torqueUnit(types[joint])} range=${range} size=${joint === picked ? LARGE : SMALL} linked=${linked} label=${`${name}: torque measured and predicted over the last ${-range[0]} seconds`} />
+    <${Plot} shown=${shown} joint=${joint} range=${range} size=${joint === picked ? LARGE : SMALL} linked=${linked} label=${`${name}: torque measured and predicted over the last ${-range[0]} seconds`} />
   </div>`;
   return html`<${Card} title="Torque">
     <p class="hint legend"><span class="measured">measured</span> <span class="predicted">predicted before learning, in the colour of the joint</span> <span class="interval">95 % interval of measurements</span> <span class="rejected">rejected (at the edge: outside the plot)</span> σ: largest innovation of the last seconds, in standard deviations</p>
@@ -35,12 +36,12 @@ export function Torque({ shown, joints, types, window, scores, largest, picked, 
   <//>`;
 }
 
-function Plot({ shown, joint, unit, range, size, linked, label }) {
+function Plot({ shown, joint, range, size, linked, label }) {
   const make = () => {
     const rows = thin(shown, size.most), reach = axisRange(rows, joint);
     const tickfont = { size: size === SMALL ? 11 : 12.5 };
     const layout = {
-      y: unit, height: size.height, showlegend: false, hovermode: false, dragmode: false, margin: { l: 52, r: 6, t: 6, b: 20 },
+      height: size.height, showlegend: false, hovermode: false, dragmode: false, margin: { l: 52, r: 6, t: 6, b: 20 },
       xaxis: { range, zeroline: false, ticksuffix: " s", nticks: size.ticks, automargin: false, tickfont },
       yaxis: { range: reach, nticks: size.ticks, automargin: false, tickfont },
     };

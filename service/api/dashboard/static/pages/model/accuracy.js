@@ -6,7 +6,7 @@ import { JointVerdicts } from "../../jointverdicts.js";
 import { html } from "../../preact.js";
 import { VerdictNote } from "../../verdicts.js";
 import { NoData } from "./choice.js";
-import { column, intervalArea, lineWithGaps, measurementStd } from "./curves.js";
+import { column, intervalArea, intervalColumns, lineWithGaps, measurementStd } from "./curves.js";
 import { AllFigures, Boxes, Reliability } from "./figures.js";
 import { JointPlots } from "./joints.js";
 import { TrainingDataNotes } from "./training_data.js";
@@ -30,15 +30,19 @@ export function Accuracy({ where, version, datasets, dataset, part }) {
     ${evaluation.value && !evaluation.value.judged && html`<${Card} title="Verdict on this recording"><${VerdictNote} verdict=${evaluation.value.verdict} /><${JointVerdicts} verdict=${evaluation.value.verdict} /><//>`}
     <${Await} reading=${trace} what="Predicting the recording">${(first) => html`
       <${TrainingDataNotes} trace=${first} />
-      <${Card} title="Measured and predicted torque"><${JointPlots} first=${first} fetch=${fetch} views=${VIEWS} about=${ABOUT} types=${version.joint_types} /><//>`}
+      <${Card} title="Measured and predicted torque"><${JointPlots} first=${first} fetch=${fetch} views=${VIEWS} about=${ABOUT} types=${version.joint_types} name=${`torque of ${version.model} ${version.version}`} numbers=${numbers} /><//>`}
     <//>
     <${Await} reading=${evaluation} what="Evaluating">${(found) => html`
       <div class="grid wide">
-        <${Card} title="Reliability"><${Reliability} evaluation=${found} /><//>
-        <${Card} title="Error by segment"><${Boxes} evaluation=${found} /><//>
+        <${Card} title="Reliability"><${Reliability} evaluation=${found} name=${`reliability of ${version.model} ${version.version}`} /><//>
+        <${Card} title="Error by segment"><${Boxes} evaluation=${found} name=${`error by segment of ${version.model} ${version.version}`} /><//>
       </div>
       <${AllFigures} evaluation=${found} />`}
     <//>`;
+}
+
+function numbers(trace, joint) {
+  return { measured: column(trace.tau, joint), ...intervalColumns("predicted", column(trace.mean, joint), measurementStd(trace, joint)) };
 }
 
 function torque(trace, joint, x) {

@@ -55,6 +55,7 @@ function Result({ model, where, version, dataset, versions }) {
       ...means.map((rows, index) => line(x, column(rows, joint), breaks, index)),
     ],
   };
+  const numbers = ({ tau, means }, joint) => ({ measured: column(tau, joint), ...Object.fromEntries(means.map((rows, index) => [`version ${order[index]}`, column(rows, joint)])) });
   return html`
     <div aria-live="polite"><${Await} reading=${compared} what="Comparing">${(found) => html`
       <${Figures} comparisons=${found} />
@@ -63,7 +64,7 @@ function Result({ model, where, version, dataset, versions }) {
         ? html`<${ByJoint} comparison=${each} />`
         : html`<details><summary>Version ${each.versions[1].version} compared with ${each.versions[0].version}, by joint</summary><${ByJoint} comparison=${each} /></details>`}`)}`}
     <//></div>
-    <${Card} title="Torques along the recording"><${Await} reading=${trace} what="Predicting the recording">${(first) => html`<${JointPlots} first=${first} fetch=${fetch} views=${views} about=${ABOUT} types=${version.joint_types} />`}<//><//>`;
+    <${Card} title="Torques along the recording"><${Await} reading=${trace} what="Predicting the recording">${(first) => html`<${JointPlots} first=${first} fetch=${fetch} views=${views} about=${ABOUT} types=${version.joint_types} name=${`versions ${order.join(", ")} of ${model.name}`} numbers=${numbers} />`}<//><//>`;
 }
 
 /** A table with a row for the reference, which is part of every comparison, and for each other version. */

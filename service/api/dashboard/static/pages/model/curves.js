@@ -16,10 +16,10 @@ export function column(rows, joint) {
   return rows.map((row) => row[joint]);
 }
 
-/** Return the horizontal axis of a trace: time, or row numbers if the time of an episode starts again. */
-export function axis(trace) {
+/** Return the horizontal axis of a trace: time since the origin, or row numbers if the time of an episode starts again. */
+export function axis(trace, origin) {
   const rising = trace.t.every((value, index) => index === 0 || value >= trace.t[index - 1]);
-  return rising ? { x: trace.t, suffix: " s" } : { x: trace.rows, suffix: "" };
+  return rising ? { x: trace.t.map((each) => each - origin), suffix: " s" } : { x: trace.rows, suffix: "" };
 }
 
 /** Return a line with gaps at the breaks of the trace. */
@@ -49,6 +49,12 @@ export function areaWithGaps(x, lower, upper, breaks, name, colour, extra = {}) 
     ys.push(...upper.slice(first, last), ...lower.slice(first, last).reverse(), upper[first]);
   }
   return { x: xs, y: ys, name, colour, type: "scatter", mode: "lines", fill: "toself", filled: true, hoverinfo: "skip", line: { width: 0 }, ...extra };
+}
+
+/** Return the columns of a mean and its 95 % interval, for files. */
+export function intervalColumns(name, mean, std) {
+  const end = (side) => mean.map((value, index) => value + side * Z95 * std[index]);
+  return { [name]: mean, [`${name}, low`]: end(-1), [`${name}, high`]: end(1) };
 }
 
 /** Return the area of the 95 % interval around a mean. */

@@ -1,6 +1,7 @@
 // Figures of an evaluation: table by joint, nMSE by segment, reliability curve.
 
 import { Card, Table } from "../../components.js";
+import { Export } from "../../exporting.js";
 import { count, counted, number, percent, scientific, sentence, shortNames } from "../../format.js";
 import { Joint, JointKey } from "../../jointbars.js";
 import { Plot } from "../../plotted.js";
@@ -8,6 +9,7 @@ import { line } from "../../plots.js";
 import { html } from "../../preact.js";
 
 const HEIGHT = 300, MARGIN = { l: 56, r: 8, t: 8, b: 44 };
+const CORNER = 5; // px, between the labels of both zeros
 
 /** A card with the figures of each joint. */
 export function AllFigures({ evaluation }) {
@@ -30,8 +32,8 @@ export function AllFigures({ evaluation }) {
   <//>`;
 }
 
-/** The nMSE of every segment, a box for each joint. */
-export function Boxes({ evaluation: { joint_names: joints, stretches } }) {
+/** The nMSE of every segment, a box for each joint. name: of exported files. */
+export function Boxes({ evaluation: { joint_names: joints, stretches }, name }) {
   const names = shortNames(joints);
   const what = stretches.kind === "episodes" ? counted(stretches.samples.length, "episode") : `${counted(stretches.samples.length, "equal segment")} of the recording`;
   const known = stretches.nmse.flat().filter((value) => value > 0);
@@ -44,20 +46,22 @@ export function Boxes({ evaluation: { joint_names: joints, stretches } }) {
   ];
   return html`
     <p class="hint">Each point is the nMSE of one of ${what}. A box contains the middle half; its line is the median. High points: motion with much worse predictions.</p>
-    <${Plot} draw=${draw} inputs=${[stretches]} label=${`nMSE of ${what}, by joint`} /><${JointKey} names=${names} />`;
+    <${Plot} draw=${draw} inputs=${[stretches]} label=${`nMSE of ${what}, by joint`} /><${JointKey} names=${names} />
+    <${Export} name=${name} table=${() => [["joint", "segment", "samples", "nMSE"], ...joints.flatMap((joint, at) => stretches.nmse[at].map((value, index) => [joint, index + 1, stretches.samples[index], value]))]} />`;
 }
 
-/** The observed coverage over the nominal one, a line for each joint. */
-export function Reliability({ evaluation: { joint_names: joints, reliability: curve } }) {
+/** The observed coverage over the nominal one, a line for each joint. name: of exported files. */
+export function Reliability({ evaluation: { joint_names: joints, reliability: curve }, name }) {
   const names = shortNames(joints), whole = { range: [0, 1], tickformat: ".0%", dtick: 0.2 };
   const draw = () => [
     [
       line([0, 1], [0, 1], "ideal", "muted", { line: { dash: "dash", width: 1.5 }, hoverinfo: "skip" }),
       ...curve.observed.map((observed, joint) => line(curve.nominal, observed, names[joint], joint, { mode: "lines+markers", marker: { size: 4 }, hovertemplate: "%{y:.1%}" })),
     ],
-    { x: "nominal coverage", y: "observed coverage", height: HEIGHT, margin: MARGIN, xaxis: whole, yaxis: whole, showlegend: false },
+    { x: "nominal coverage", y: "observed coverage", height: HEIGHT, margin: MARGIN, xaxis: { ...whole, ticklabelstandoff: CORNER }, yaxis: whole, showlegend: false },
   ];
   return html`
     <p class="hint">The dashed diagonal is ideal. Below it, the intervals are too narrow: the model is overconfident. Above it, they are too wide.</p>
-    <${Plot} draw=${draw} inputs=${[curve]} label="Observed over nominal coverage, by joint" /><${JointKey} names=${names} />`;
+    <${Plot} draw=${draw} inputs=${[curve]} label="Observed over nominal coverage, by joint" /><${JointKey} names=${names} />
+    <${Export} name=${name} table=${() => [["joint", "nominal coverage", "observed coverage"], ...joints.flatMap((joint, at) => curve.nominal.map((value, index) => [joint, value, curve.observed[at][index]]))]} />`;
 }

@@ -2,7 +2,8 @@
 
 import { jointVar } from "../../colours.js";
 import { Button, Choice, ErrorBox, Field, useRead } from "../../components.js";
-import { count, shortNames, torqueUnit } from "../../format.js";
+import { Export } from "../../exporting.js";
+import { count, shortNames, timeOrigin, torqueUnit } from "../../format.js";
 import { Joint } from "../../jointbars.js";
 import { LinkedPlots } from "../../linked.js";
 import { Plot } from "../../plotted.js";
@@ -13,13 +14,14 @@ const ALL = "all joints";
 
 /**
  * A trace as plots, one for each joint. first: trace of all rows; fetch({start, stop}, signal): read the trace of some rows;
- * views: {label: (trace, joint, x) => traces}, of which one is shown; about: {label: explanation}; types: of the joints.
+ * views: {label: (trace, joint, x) => traces}, of which one is shown; about: {label: explanation}; types: of the joints;
+ * name: of exported files; numbers: (trace, joint) => {heading: values}, their columns.
  */
-export function JointPlots({ first, fetch, views, about, types }) {
+export function JointPlots({ first, fetch, views, about, types, name: title, numbers }) {
   const { joint_names: joints } = first, names = shortNames(joints), labels = Object.keys(views);
   const [joint, setJoint] = useState(ALL), [view, setView] = useState(labels[0]), [rows, setRows] = useState(null);
   const read = useRead(async (signal) => (rows ? fetch(rows, signal) : first), [first, rows]);
-  const trace = read.value ?? first, { x, suffix } = axis(trace);
+  const trace = read.value ?? first, { x, suffix } = axis(trace, timeOrigin(first.t[0]));
   const linked = useMemo(() => new LinkedPlots({ stays: false }), []);
   const shown = useRef(null);
   shown.current = { trace, x, rows };
@@ -48,6 +50,7 @@ export function JointPlots({ first, fetch, views, about, types }) {
         label=${`${view} of ${name} along the recording, ${trace.shown} of ${trace.in_range} rows`} />
     </div>`;
   };
+  const table = () => tableOf(trace, joints.filter((each) => !alone || each === joint), (name) => torqueUnit(types?.[joints.indexOf(name)]), (name) => numbers(trace, joints.indexOf(name)));
   return html`
     <div class="grid">
       <${Choice} label="Joint" options=${[ALL, ...joints]} value=${joint} onchange=${setJoint} />
@@ -57,7 +60,15 @@ export function JointPlots({ first, fetch, views, about, types }) {
     <${Legend} traces=${views[view](trace, 0, x)} />
     ${read.error && html`<${ErrorBox} error=${read.error} />`}
     <div class="joint-plots">${joints.map(one)}</div>
+    <${Export} name=${title} table=${table} />
     <${RowsForm} trace=${trace} choose=${setRows} />`;
+}
+
+/** Return the shown rows of joints as a table. unit(joint): of its torque; columns(joint): {heading: values}. */
+function tableOf(trace, joints, unit, columns) {
+  const parts = joints.map((joint) => [joint, Object.entries(columns(joint))]);
+  const rows = parts.flatMap(([joint, found]) => trace.rows.map((row, index) => [joint, unit(joint), row, trace.t[index], ...found.map(([, values]) => values[index])]));
+  return [["joint", "unit", "row", "time, s", ...parts[0][1].map(([heading]) => heading)], ...rows];
 }
 
 function RowsForm({ trace, choose }) {

@@ -7,7 +7,12 @@ import { Joint } from "../../jointbars.js";
 import { html } from "../../preact.js";
 
 /** The tab, updated every five seconds. */
-export function Learning({ where, model: { name } }) {
+export function Learning({ where, model: { name, serving_version: serving } }) {
+  if (serving === null) return html`<${Empty} text="No version is serving, so nothing is learnt online." />`;
+  return html`<${Shown} where=${where} name=${name} />`;
+}
+
+function Shown({ where, name }) {
   const { value, error, reload } = useRead((signal) => Promise.all([
     get(`${where}/learning`, {}, signal), get(`${where}/quality`, {}, signal), get(`${where}/alarms`, { limit: 5 }, signal),
   ]), [where], 5);
