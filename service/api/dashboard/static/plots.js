@@ -2,6 +2,7 @@
 
 import { css, withOpacity, jointColour } from "./colours.js";
 
+const CORNER_PX = 5; // keeps the first label of the x axis away from the lowest one of the y axis
 const SPATIAL = new Set(["scatter3d", "mesh3d"]);
 const loading = new Map();
 
@@ -109,7 +110,7 @@ function withTheme({ title = "", x = "", y = "", height = 300, ...rest }) {
     font: { family: "inherit", size: 12.5, color: css("text") },
     hoverlabel: { bgcolor: css("surface"), bordercolor: css("line-strong"), font: { color: css("text") } },
     ...Object.fromEntries(Object.keys(rest).filter((name) => /^[xy]axis\d+$/.test(name)).map((name) => [name, own(name, "")])),
-    xaxis: own("xaxis", x),
+    xaxis: { ticklabelstandoff: CORNER_PX, ...own("xaxis", x) },
     yaxis: own("yaxis", y),
   };
 }

@@ -61,7 +61,7 @@ function View({ preview: read, dataset, rows, choose }) {
     <div class="quantities" ref=${all}>${QUANTITIES.map(([quantity, name], index) => html`<section key=${quantity} aria-label=${name}>
       <h3>${name} <span class="muted">${[quantity, dataset.report.derived.includes(quantity) && "derived", !signals.types && signals.units(quantity)].filter(Boolean).join(", ")}</span></h3>
       <div class="multiple" style=${`--rows: ${joints.length}; --row: ${signals.rowHeight(joints.length)}px`}>
-        <div class="strip" ref=${places[index]}></div>
+        <div class="strip" role="img" aria-label=${name} ref=${places[index]}></div>
         <ul aria-label=${`${name} at the cursor`}>${joints.map((each) => html`<li key=${each}><span class="joint" style=${`--own: ${signals.colour(each)}`} title=${signals.joints[each]}>${signals.names[each]}</span><output>${signals.valueAt(quantity, each, axis, at)}</output></li>`)}</ul>
       </div>
     </section>`)}</div>

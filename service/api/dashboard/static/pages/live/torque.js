@@ -10,6 +10,7 @@ import { LivePlot } from "./live_plot.js";
 export const HALF_WIDTH = 1.96;
 const MAX_POINTS = 300;
 const SMALL = { height: 130, most: 150, ticks: 4 }, LARGE = { height: 320, most: MAX_POINTS, ticks: 8 };
+const MIN_SPAN = 1e-3, MIN_SHARE = 0.01; // of an axis: N·m, and share of the torque, whose labels would be too long
 const FULL_BAR_STD = 8; // innovation that fills the bar of a joint
 
 /** A plot of each joint; the picked one is large. cursor: time in s, or null; pick(joint): called when a joint is selected. */
@@ -41,7 +42,7 @@ function Plot({ shown, joint, range, size, linked, label }) {
     const rows = thin(shown, size.most), reach = axisRange(rows, joint);
     const tickfont = { size: size === SMALL ? 11 : 12.5 };
     const layout = {
-      height: size.height, showlegend: false, hovermode: false, dragmode: false, margin: { l: 52, r: 6, t: 6, b: 20 },
+      height: size.height, showlegend: false, hovermode: false, dragmode: false, margin: { l: 52, r: 6, t: 6, b: 24 },
       xaxis: { range, zeroline: false, ticksuffix: " s", nticks: size.ticks, automargin: false, tickfont },
       yaxis: { range: reach, nticks: size.ticks, automargin: false, tickfont },
     };
@@ -126,6 +127,7 @@ function axisRange(rows, joint) {
   }
   const [low, high] = usual[0] <= usual[1] ? usual : all;
   if (!(low <= high)) return [-1, 1];
-  const span = Math.max(high - low, 1e-3);
-  return [Math.max(Math.min(all[0], low), low - span) - 0.05 * span, Math.min(Math.max(all[1], high), high + span) + 0.05 * span];
+  const span = Math.max(high - low, MIN_SPAN, MIN_SHARE * Math.max(Math.abs(low), Math.abs(high)));
+  const around = 0.05 * span + (span - (high - low)) / 2;
+  return [Math.max(Math.min(all[0], low), low - span) - around, Math.min(Math.max(all[1], high), high + span) + around];
 }

@@ -9,7 +9,6 @@ import { line } from "../../plots.js";
 import { html } from "../../preact.js";
 
 const HEIGHT = 300, MARGIN = { l: 56, r: 8, t: 8, b: 44 };
-const CORNER = 5; // px, between the labels of both zeros
 
 /** A card with the figures of each joint. */
 export function AllFigures({ evaluation }) {
@@ -52,13 +51,13 @@ export function Boxes({ evaluation: { joint_names: joints, stretches }, name }) 
 
 /** The observed coverage over the nominal one, a line for each joint. name: of exported files. */
 export function Reliability({ evaluation: { joint_names: joints, reliability: curve }, name }) {
-  const names = shortNames(joints), whole = { range: [0, 1], tickformat: ".0%", dtick: 0.2 };
+  const names = shortNames(joints), whole = { range: [0, 1], tickformat: ".0%", dtick: 0.25 };
   const draw = () => [
     [
       line([0, 1], [0, 1], "ideal", "muted", { line: { dash: "dash", width: 1.5 }, hoverinfo: "skip" }),
       ...curve.observed.map((observed, joint) => line(curve.nominal, observed, names[joint], joint, { mode: "lines+markers", marker: { size: 4 }, hovertemplate: "%{y:.1%}" })),
     ],
-    { x: "nominal coverage", y: "observed coverage", height: HEIGHT, margin: MARGIN, xaxis: { ...whole, ticklabelstandoff: CORNER }, yaxis: whole, showlegend: false },
+    { x: "nominal coverage", y: "observed coverage", height: HEIGHT, margin: MARGIN, xaxis: whole, yaxis: whole, showlegend: false },
   ];
   return html`
     <p class="hint">The dashed diagonal is ideal. Below it, the intervals are too narrow: the model is overconfident. Above it, they are too wide.</p>
