@@ -103,7 +103,7 @@ def add_scopes(document: dict[str, Any], rules: Rules, keys_needed: bool) -> Non
             operation["description"] = f"{operation.get('description', '')}\n\nScope: `{scope}`.".strip()
 
 
-METHODS = ("get", "put", "post", "delete")
+METHODS = ("get", "put", "post", "patch", "delete")
 BEFORE_ROUTES = {
     (405, "method_not_allowed"): "The path does not support the method. The header `Allow` lists the supported ones."
 }

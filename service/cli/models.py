@@ -89,13 +89,17 @@ def show(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> 
         paused = "; learning is paused until you decide" if learning.held is not None else ""
         learnt = f"revision {learning.published} of {learning.revision} serving"
         echo(f"  online learning: {learnt if learning.revision else 'nothing learnt yet'}{paused}")
+    noted = any(each.note or each.tags for each in record.versions)
     table = Table("version", "verdict", "max error of range", "coverage", "estimator", "created", "aliases")
+    if noted:
+        table.add_column("note and tags")
     for each in record.versions:
         named = [name for name, at in record.aliases.items() if at == each.version]
         named = [SERVING, *named] if each.version == record.serving_version else named
         at = each.created_at[:16].replace("T", " ")
         cells = verdict_cells(each.verdict)
-        table.add_row(str(each.version), *cells, each.estimator, at, escape(", ".join(named)) or "-")
+        words = escape(" ".join([each.note or "", *(f"[{tag}]" for tag in each.tags)]).strip()) or "-"
+        table.add_row(str(each.version), *cells, each.estimator, at, escape(", ".join(named)) or "-", *[words] * noted)
     out.print(table)
     _print_version(detail)
 
@@ -208,6 +212,31 @@ def thresholds(
         f"coverage below {percent(known.min_coverage)}; too uncertain if intervals are wider than {known.max_width:g} "
         "times those of the mean torque",
     )
+
+
+@app.command("note")
+def annotate(
+    model: ModelVersion,
+    text: Annotated[str | None, typer.Argument(help='The note; "" removes it.')] = None,
+    tag: Annotated[
+        list[str] | None, typer.Option(help='Tag; may be repeated. Replaces all tags; "" removes them.')
+    ] = None,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Print the note and the tags of a version (default: the serving version), or set them."""
+    from lipserve.call import split_name  # noqa: PLC0415 - slow import, not needed for help
+
+    with connected(url) as client:
+        name, which = split_name(model)
+        version = _number(client.model(name), **which)
+        if text is None and tag is None:
+            found = client.version(name, version)
+        else:
+            found = client.annotate(name, version, text, None if tag is None else [each for each in tag if each])
+    tags = f"tags: {', '.join(found.tags)}" if found.tags else "no tags"
+    shown = {"note": found.note, "tags": found.tags}
+    print_result(shown, as_json, f"{name} version {version}: {found.note or 'no note'}; {tags}")
 
 
 @app.command()

@@ -9,6 +9,7 @@ from pydantic import BaseModel, Field
 Change = Literal[
     "version added",
     "version deleted",
+    "version annotated",
     "model deleted",
     "alias moved",
     "learning set",

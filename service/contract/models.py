@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, field_validator
 
 from lipcore.vocabulary import ComponentName, JointType, TorqueConvention
 from service.contract.states import PromotionOption
@@ -18,6 +18,17 @@ VERSION = r"^[a-z0-9][a-z0-9._-]{0,63}([:@][1-9][0-9]{0,8}|@[a-z][a-z0-9._-]{0,6
 """A version in one text: `model@3`, `model@alias`, or `model` for the serving version. Jobs keep it as `model:3`."""
 AliasName = Annotated[str, StringConstraints(pattern=ALIAS)]
 """A letter, then lower-case letters, digits, dots, underscores and hyphens: never a version number."""
+
+
+def _check_printable(text: str) -> str:
+    if not text.replace("\n", "").isprintable():
+        raise ValueError("only printable characters and line ends")
+    return text
+
+
+Note = Annotated[str, StringConstraints(max_length=500, strip_whitespace=True), AfterValidator(_check_printable)]
+Tag = Annotated[str, StringConstraints(max_length=40, strip_whitespace=True, pattern=r"^[^,\n]+$")]
+Tags = Annotated[list[Annotated[Tag, AfterValidator(_check_printable)]], Field(max_length=10)]
 
 
 class SelectionCandidate(BaseModel):
@@ -83,6 +94,8 @@ class Version(BaseModel):
     version: int
     created_at: str
     job: str | None = Field(description="Job that trained it; null for an imported or shipped version")
+    note: str | None = Field(None, description="Note on the version, as set by a user")
+    tags: list[str] = Field([], description="Tags of the version, as set by a user")
     estimator: str
     components: list[ComponentName] = Field(description="Components of the torque that it offers")
     joint_names: list[str]
@@ -134,6 +147,8 @@ class VersionSummary(BaseModel):
 
     version: int
     created_at: str
+    note: str | None = Field(None, description="Note on the version, as set by a user")
+    tags: list[str] = Field([], description="Tags of the version, as set by a user")
     estimator: str
     verdict: Verdict
     promotion: Promotion | None = Field(
@@ -160,6 +175,23 @@ class ModelPage(BaseModel):
 
     items: list[Model]
     next_cursor: str | None
+
+
+class Annotation(BaseModel):
+    """Note and tags of a version. Omitted fields stay; null or an empty value removes them."""
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, json_schema_extra={"examples": [{"note": "new gripper", "tags": ["line 2"]}]}
+    )
+
+    note: Note | None = Field(None, description="Text of at most 500 characters")
+    tags: Tags | None = Field(None, description="At most 10 tags of at most 40 characters, without commas")
+
+    @field_validator("note", "tags")
+    @classmethod
+    def _normalise(cls, value: Any) -> Any:
+        """Read empty values as null, and a repeated tag as one."""
+        return (list(dict.fromkeys(value)) if isinstance(value, list) else value) or None
 
 
 class AliasRequest(BaseModel):

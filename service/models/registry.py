@@ -312,7 +312,8 @@ def show_version(database: Database, model: str, version: int) -> Version:
     """Return one version with its lineage; raise NotFoundError."""
     row = find(database, model, version)
     fields = {name: row.manifest[name] for name in Version.model_fields if name in row.manifest}
-    about = {"model": row.model, "version": row.version, "created_at": row.created_at, "job": row.job}
+    names = ("model", "version", "created_at", "job", "note")
+    about = {**{name: getattr(row, name) for name in names}, "tags": row.tags or []}
     options = verdict_options(database, [model]).get(model, OPTIONS)
     return Version(
         **about,
@@ -366,6 +367,8 @@ def _show(session: Session, row: ModelRow) -> Model:
             VersionSummary(
                 version=v.version,
                 created_at=v.created_at,
+                note=v.note,
+                tags=v.tags or [],
                 estimator=v.manifest["estimator"],
                 verdict=verdicts.of_version(v.manifest, options),
                 promotion=v.manifest.get(PROMOTION),

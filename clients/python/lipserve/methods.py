@@ -112,6 +112,7 @@ class Calls:
     model = One(calls.models.model)
     delete_model = One(calls.models.delete_model)
     version = One(calls.models.version)
+    annotate = One(calls.models.annotate)
     delete_version = One(calls.models.delete_version)
     aliases = One(calls.models.aliases)
     set_alias = One(calls.models.set_alias)

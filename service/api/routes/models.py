@@ -26,7 +26,7 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
 )
 from service.foundation.fields import BINARY, upload_body
-from service.models import aliases, archive, archive_import, deletion, registry
+from service.models import aliases, archive, archive_import, deletion, notes, registry
 
 _BINARY = {"schema": BINARY}
 _BODY = upload_body("An archive written by an export.", {archive.MEDIA_TYPE: _BINARY}, "A .tar file")
@@ -166,6 +166,17 @@ def set_thresholds(loaded: LoadedModelsDep, model: str, thresholds: Thresholds) 
 def show_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> schema.Version:
     """Return a version: joints, noise, training range, options, report of the fit, and training data."""
     return registry.show_version(loaded.database, model, version)
+
+
+@router.patch(
+    "/{model}/versions/{version}", summary="Set the note and the tags of a version", responses=responses(NotFoundError)
+)
+@needs(ADMIN)
+def annotate_version(
+    loaded: LoadedModelsDep, model: str, version: schema.VersionNumber, annotation: schema.Annotation
+) -> schema.Version:
+    """Change the note, the tags or both. An omitted field stays; null or an empty value removes it."""
+    return notes.annotate(loaded.database, model, version, annotation)
 
 
 @router.delete(

@@ -133,7 +133,7 @@ class DeletedModelRow(Base):
 
 
 class VersionRow(Base):
-    """An immutable trained version of a model; the file store keeps its files under `folder`."""
+    """A trained version of a model; the file store keeps its files under `folder`. Only `note` and `tags` change."""
 
     __tablename__ = "versions"
 
@@ -145,6 +145,8 @@ class VersionRow(Base):
     manifest: Mapped[dict[str, Any]]
     checksums: Mapped[dict[str, Any] | None]
     """sha256 of each file by name; None for versions stored before checksums existed."""
+    note: Mapped[str | None] = mapped_column(default=None)
+    tags: Mapped[list[str] | None] = mapped_column(JSON, default=None)
 
 
 class AliasRow(Base):

@@ -87,6 +87,14 @@ def scripted(*answers, reached=True, **options):
     return client, sent
 
 
+def test_annotation_sends_what_is_given():
+    annotate = calls.models.annotate
+    assert annotate("m", 1).json == {}
+    assert annotate("m", 1, note="", tags=()).json == {"note": "", "tags": []}
+    call = annotate("m", 1, "spare", ["line 2"])
+    assert (call.method, call.path, call.json["note"]) == ("PATCH", "/v1/models/m/versions/1", "spare")
+
+
 def later(status=429, **headers):
     body = {"error": {"code": "busy", "message": "try again later", "detail": []}}
     return httpx.Response(status, json=body, headers={name.replace("_", "-"): value for name, value in headers.items()})

@@ -42,6 +42,17 @@ def test_wait_cancel_and_retry_jobs(client, server):
     assert caught.value.status == 404
 
 
+def test_versions_are_annotated(client, server):
+    assert client.annotate("panda-sim", 1, note="spare", tags=["line 2"]).tags == ["line 2"]
+    assert client.annotate("panda-sim", 1, tags=[]).note == "spare"
+    assert client.model("panda-sim").versions[0].note == "spare"
+
+    async def remove(client):
+        return await client.annotate("panda-sim", 1, note="")
+
+    assert ask(server.url, remove).note is None
+
+
 def test_api_errors_have_code_message_and_detail(client, tmp_path):
     with pytest.raises(ApiError, match="`q` has 6 values; this model has 7 joints: panda_joint1") as caught:
         client.predict("panda-sim", [0.0] * 6, [0.0] * 6, [0.0] * 6)

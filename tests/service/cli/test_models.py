@@ -42,6 +42,21 @@ def test_promotion_can_be_rolled_back(run_command, arm):
     run_command("models", "alias", name, "day", "--remove")
 
 
+def test_versions_have_notes_and_tags(run_command, run_rejected_command, arm):
+    name, note = f"{arm[0]}@1", "[red]old gripper[/red]"
+    assert "version 1: no note; no tags" in run_command("models", "note", name)
+    assert f"version 1: {note}; tags: line 2, ros" in run_command(
+        "models", "note", name, note, "--tag", "line 2", "--tag", "ros"
+    )
+    assert run_command("models", "note", name, "--tag", "ros", "--json") == {"note": note, "tags": ["ros"]}
+    shown = run_command("models", "show", name, "--json")
+    assert (shown["version"]["note"], shown["model"]["versions"][0]["tags"]) == (note, ["ros"])
+    assert "note and tags" in run_command("models", "show", name)
+    assert run_command("models", "note", name, "", "--tag", "", "--json") == {"note": None, "tags": []}
+    assert "note and tags" not in run_command("models", "show", name)
+    assert "at most 500 characters" in run_rejected_command("models", "note", name, "a" * 501)
+
+
 def test_versions_are_compared(run_command, arm):
     name, dataset = arm
     compared = run_command("models", "compare", name, dataset, 1, 2, "--json")

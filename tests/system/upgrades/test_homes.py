@@ -103,6 +103,7 @@ def test_models_datasets_keys_and_log_are_kept(upgraded):
         for version in found["versions"]:  # fields of later releases
             assert version.pop("verdict")["level"] == "not_judged"
             assert version.pop("promotion")["reason"] == "not judged, as nothing was held out"
+            assert (version.pop("note"), version.pop("tags")) == (None, [])
         assert found == recorded
     assert [each["id"] for each in api.get("/v1/datasets").json()["items"]] == [RECORDED["dataset"]]
     old = bearer(RECORDED["key"]["secret"])

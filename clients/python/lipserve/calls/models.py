@@ -189,6 +189,26 @@ def version(_route: Route, model: str, version: int) -> Call[Version]:
     return _route(record(Version), names={"model": model, "version": version})
 
 
+@route("PATCH", "/v1/models/{model}/versions/{version}")
+def annotate(
+    _route: Route, model: str, version: int, note: str | None = None, tags: Sequence[str] | None = None
+) -> Call[Version]:
+    """Set the note and the tags of a version; those that are None stay.
+
+    Args:
+        model: Name of the model.
+        version: Version number.
+        note: Text of at most 500 characters; "" removes the note.
+        tags: At most 10 tags of at most 40 characters; [] removes them.
+
+    Example:
+        >>> client.annotate("my-arm", 1, note="before the new gripper", tags=["line 2"]).tags
+        ['line 2']
+    """
+    body = given(note=note, tags=None if tags is None else list(tags))
+    return _route(record(Version), names={"model": model, "version": version}, json=body)
+
+
 @route("DELETE", "/v1/models/{model}/versions/{version}")
 def delete_version(_route: Route, model: str, version: int) -> Call[None]:
     """Delete a version that is not in use permanently."""

@@ -30,6 +30,7 @@ class AuditEntry(Record, frozen=True, kw_only=True):
     change: Literal[
         "version added",
         "version deleted",
+        "version annotated",
         "model deleted",
         "alias moved",
         "learning set",

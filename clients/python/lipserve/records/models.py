@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+from msgspec import field
+
 from lipserve.records import Record
 from lipserve.records.verdicts import Thresholds, Verdict
 
@@ -23,11 +25,15 @@ class Promotion(Record, frozen=True, kw_only=True):
 class VersionSummary(Record, frozen=True, kw_only=True):
     """A version in the list of its model.
 
+    note: Note on the version, as set by a user
+    tags: Tags of the version, as set by a user
     promotion: Whether it became the serving version, and why; null for a refreshed or shipped version
     """
 
     version: int
     created_at: str
+    note: str | None = None
+    tags: list[str] = field(default_factory=list)
     estimator: str
     verdict: Verdict
     promotion: Promotion | None = None
@@ -108,6 +114,8 @@ class Version(Record, frozen=True, kw_only=True):
     """An immutable, trained version.
 
     job: Job that trained it; null for an imported or shipped version
+    note: Note on the version, as set by a user
+    tags: Tags of the version, as set by a user
     components: Components of the torque that it offers
     noise_std: Standard deviation of the measured torque, N·m
     training_range: Range of the training samples by quantity and joint
@@ -133,6 +141,8 @@ class Version(Record, frozen=True, kw_only=True):
     version: int
     created_at: str
     job: str | None
+    note: str | None = None
+    tags: list[str] = field(default_factory=list)
     estimator: str
     components: list[
         Literal[

@@ -13,6 +13,7 @@ export class ApiError extends Error {
 export const get = (path, params, signal) => send("GET", path, { params, signal });
 export const post = (path, body, signal) => send("POST", path, { body, signal });
 export const put = (path, body, signal) => send("PUT", path, { body, signal });
+export const patch = (path, body, signal) => send("PATCH", path, { body, signal });
 export const del = (path, signal) => send("DELETE", path, { signal });
 
 /** Return a path with its values percent-encoded: path`/v1/models/${name}`. */

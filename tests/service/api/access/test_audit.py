@@ -22,7 +22,7 @@ from tests.service.learning.learning_models import observation_batch
 from tests.service.models.archives.packing import TAR, exported
 from tests.service.models.versions import publish
 
-POST, PUT, DELETE = "POST", "PUT", "DELETE"
+POST, PUT, PATCH, DELETE = "POST", "PUT", "PATCH", "DELETE"
 MODEL = "/v1/models/{model}"
 BATCH = MODEL + "/observations/{stream_id}/{sequence}"
 LEARNING = {"contact_threshold": 8.0, "auto_refresh": False, "on_change": "learn"}
@@ -116,6 +116,12 @@ PAYLOAD, BODY = "panda-sim/payload", {"mass": 1.0, "com": [0, 0, 0.1]}
 DECLARED, REMOVED = {"body": BODY | {"inertia": None}}, {"stream_id": None, "body": None}
 CHANGING = {
     (POST, "/v1/models/import"): (import_version, "version added", None, {"estimator": "lip-chain", "job": None}),
+    (PATCH, MODEL + "/versions/{version}"): (
+        sender((PATCH, "arm/versions/1", {"tags": ["first"]})),
+        "version annotated",
+        {"note": None, "tags": []},
+        {"note": None, "tags": ["first"]},
+    ),
     (DELETE, MODEL + "/versions/{version}"): (remove_version, "version deleted", 3, None),
     (PUT, MODEL + "/aliases/{alias}"): (sender(move_request("production", 1)), "alias moved", None, 1),
     (POST, MODEL + "/aliases/{alias}/rollback"): (roll_back, "alias moved", 2, 1),

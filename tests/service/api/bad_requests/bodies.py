@@ -22,6 +22,7 @@ from tests.service.api.bad_requests.bad import (
 
 INF, NAN = float("inf"), float("nan")
 HOMOGLYPH, BIDI, ZERO_WIDTH, NUL, HALF = "p\u0430nda", "a\u202eb", "a\u200bb", "a\x00b", "a\ud800"
+VERSION = "/v1/models/panda-sim/versions/1"
 ODD = ("", "a b", "a\n", "-a", "../a", "a" * 65, HOMOGLYPH, BIDI, ZERO_WIDTH, NUL, HALF)
 """Invalid names of a model, a stream or an alias."""
 TEXTS = (
@@ -189,6 +190,10 @@ SETTING = [
     *with_missing_name(ROLLBACK, {}, "version", 99),
     *with_value("/v1/models/panda-sim/learning/change", {}, "decision", "wait", None),
     *with_value("/v1/models/panda-sim/refresh", {}, "estimator", "lip"),
+    *with_value(VERSION, {}, "note", 1, ["a"], "a" * 501, BIDI, NUL, HALF, method="PATCH"),
+    *with_value(VERSION, {}, "tags", "a", ["a"] * 11, method="PATCH"),
+    *(body(VERSION, {"tags": [tag]}, "tags[0]", method="PATCH") for tag in ("", " ", "a,b", "a\nb", "a" * 41, NUL, 1)),
+    body(f"{VERSION}9", {"note": "a"}, "version", status=404, code="not_found", method="PATCH"),
     *with_value(f"{ALIASES}/best", {}, "version", 0, "x", 1.5, method="PUT"),
     *with_value(f"{ALIASES}/best", {}, "version", 99, status=404, code="not_found", method="PUT"),
     *(body(f"{ALIASES}/{alias}", {"version": 1}, "alias", method="PUT") for alias in ("A", "1", "a%20b", "a" * 65)),

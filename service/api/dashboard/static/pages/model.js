@@ -15,6 +15,7 @@ import { Components } from "./model/parts.js";
 import { Learning } from "./model/learning.js";
 import { Lineage } from "./model/lineage.js";
 import { Predict } from "./model/predict.js";
+import { NoteText } from "./model/notes.js";
 import { moveAlias, servingButton } from "./model/serving.js";
 import { Versions } from "./model/versions.js";
 
@@ -79,6 +80,7 @@ function VersionPage({ tab, setTab, wanted, setWanted, ...given }) {
 function Header({ model, where, version, changed }) {
   const { name, serving_version: serving, aliases } = model, shown = version.version;
   const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
+  const { note, tags } = model.versions.find((each) => each.version === shown);
   const [label, kind] = servingButton(version);
   const serve = async () => {
     if (await moveAlias({ name, where, model }, "serving", version)) changed(`Version ${shown} of ${name} is now serving.`);
@@ -93,7 +95,8 @@ function Header({ model, where, version, changed }) {
         <${Link} to=${`#/train?model=${encodeURIComponent(name)}`}>Train a new version<//>
       </div>
     <//>
-    <p class="muted">${[answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")}</p>`;
+    <p class="muted">${[answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")}</p>
+    ${(note || tags.length > 0) && html`<p><${NoteText} note=${note} tags=${tags} /></p>`}`;
 }
 
 function Verdict({ version, open }) {

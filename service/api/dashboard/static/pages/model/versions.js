@@ -8,6 +8,7 @@ import { confirm } from "../../dialogs.js";
 import { VERDICT_HINT, verdictColumns } from "../../verdicts.js";
 import { Compare } from "./compare.js";
 import { exportVersion } from "./export.js";
+import { Note } from "./notes.js";
 import { moveAlias, servingButton } from "./serving.js";
 
 /** The tab. */
@@ -45,9 +46,10 @@ function List({ model, where, aliases, version, view, changed }) {
     ...verdictColumns((each) => each.verdict),
     { label: "Estimator", value: (each) => each.estimator, cell: (each) => each.estimator },
     { label: "Created", value: (each) => each.created_at, first: "descending", cell: (each) => html`<time datetime=${each.created_at} title=${when(each.created_at)}>${ago(each.created_at)}</time>` },
+    { label: "Note", cell: (each) => html`<${Note} where=${where} version=${each} changed=${changed} />` },
     { label: "Actions", cell: actions },
   ];
-  const words = (each) => [`version ${each.version}`, each.estimator, each.verdict.label, ...named(each.version)].join(" ");
+  const words = (each) => [`version ${each.version}`, each.estimator, each.note, ...each.tags, each.verdict.label, ...named(each.version)].join(" ");
   return html`<${Listing} columns=${columns} rows=${[...model.versions].reverse()} caption="Versions, newest first" what=${["version", "versions"]} identity=${(each) => each.version} words=${words} minRows=${4} />`;
 }
 
