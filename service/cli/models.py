@@ -21,8 +21,8 @@ from service.foundation.text import counted, percent
 
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
+    from lipserve.records.models import AliasMove, Selection
     from lipserve.records.models import Model as ModelRecord
-    from lipserve.records.models import Selection
     from lipserve.records.verdicts import Verdict
     from lipserve.results.arm import Version as VersionRecord
     from service.contract.states import PromotionOption
@@ -76,6 +76,7 @@ def show(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> 
         name, which = split_name(model)
         record = client.model(name)
         detail = client.version(name, _number(record, **which))
+        aliases = client.aliases(name)
         try:
             learning = client.learning(name).status
         except ApiError:  # the serving version cannot be read; show the others
@@ -85,6 +86,9 @@ def show(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> 
         return
     serving = "none" if record.serving_version is None else f"version {record.serving_version}"
     echo(f"{record.name}: serving {serving}, newest version {record.latest_version}")
+    for moved in aliases:
+        if moved.alias == SERVING and moved.history[0].before is not None:
+            echo(f"  {_move(moved.history[0])}")
     if learning is not None:
         paused = "; learning is paused until you decide" if learning.held is not None else ""
         learnt = f"revision {learning.published} of {learning.revision} serving"
@@ -176,11 +180,7 @@ def alias(
         raise CommandError(
             f"{model} has no alias {name!r}", f"`lipserve models alias {model} {name} VERSION` creates it"
         )
-    moves = (
-        f"  {move.at[:19].replace('T', ' ')}  {move.before or 'none'} → {move.version or 'none'}"
-        + (" (rolled back)" if move.rollback else "")
-        for move in aliases[0].history
-    )
+    moves = (f"  {_move(each)}" for each in aliases[0].history)
     print_result(aliases[0], as_json, f"{name} → {model} version {aliases[0].version}", *moves)
 
 
@@ -364,6 +364,11 @@ def _number(record: ModelRecord, version: int | None = None, alias: str | None =
             f"{record.name} has no alias {alias!r}", f"its aliases: {', '.join(record.aliases) or 'none'}"
         )
     return record.aliases[alias]
+
+
+def _move(move: AliasMove) -> str:
+    what = f"{move.at[:19].replace('T', ' ')}  {move.before or 'none'} → {move.version or 'none'}"
+    return what + (" (rolled back)" if move.rollback else "")
 
 
 def _which(text: str) -> int | str:

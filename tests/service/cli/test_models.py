@@ -30,6 +30,7 @@ def test_promotion_can_be_rolled_back(run_command, arm):
     assert run_command(*promote, 1, "--json")["version"] == 1
     assert f"serving → {name} version 2" in run_command(*promote, 2)
     assert run_command("models", "rollback", name, "--json")["version"] == 1
+    assert "2 → 1 (rolled back)" in run_command("models", "show", name)
     run_command(*promote, 2)
     assert "version 1" in run_command(*promote, 1, "--alias", "night")
     assert run_command(*promote, "night", "--alias", "day", "--json")["version"] == 1
