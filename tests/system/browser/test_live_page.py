@@ -243,6 +243,26 @@ def test_all_plots_share_cursor_and_alarm_marks(visitor: Visitor, dashboard: Das
         visitor.until(lambda: visitor.overflow() == 0)
 
 
+@pytest.mark.parametrize(
+    ("shares", "badge"),
+    [
+        ([0.95, 0.9], ["coverage 90\u00a0%", "good"]),
+        ([0.95, 0.625], ["coverage 63\u00a0% on elbow", "warn"]),
+        ([None, 0.99], ["coverage 99\u00a0%", "good"]),
+    ],
+)
+def test_low_coverage_names_its_joint(visitor: Visitor, shares: list[float | None], badge: list[str]) -> None:
+    status = {"windows": [{"coverage": shares}], "joint_names": ["shoulder", "elbow"]}
+    found = visitor.open("#/data").evaluate(
+        """async (status) => {
+          const { coverage } = await import("/dashboard/pages/live/follow.js");
+          return coverage(status);
+        }""",
+        status,
+    )
+    assert found == badge
+
+
 def test_live_page_changes_learning_settings(visitor: Visitor, dashboard: Dashboard, copied: Any) -> None:
     model = copied("switched")
     page = visitor.open(f"#/live/{model}")

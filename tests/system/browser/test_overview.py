@@ -209,6 +209,22 @@ def test_models_that_need_attention_come_first(visitor: Visitor, windows: Visit,
     assert audit(phone.page) == []
 
 
+def test_live_model_comes_before_an_idle_one_with_a_candidate(visitor: Visitor, dashboard: Dashboard) -> None:
+    page, live = visitor.page, "panda-sim"
+
+    def answer(route: Route) -> None:
+        body = route.fetch().json()
+        states = {live: {"idle_s": 5, "candidate": None}, dashboard.model: {"idle_s": None, "candidate": 4}}
+        route.fulfill(json={**body, "items": [{**each, **states.get(each["name"], {})} for each in body["items"]]})
+
+    page.route("**/v1/overview?*", answer)
+    visitor.open("#/")
+    expect(card(page, dashboard.model)).to_contain_text("Version 4 is a candidate.")
+    cards = page.get_by_role("region", name="Models").locator("li").all()
+    order = [each.get_attribute("data-key") for each in cards]
+    assert order.index(live) < order.index(dashboard.model)
+
+
 @pytest.mark.parametrize("state", [slow("warning"), "failed"])
 def test_health_is_one_line_until_a_check_fails(visitor: Visitor, state: str) -> None:
     page = visitor.page

@@ -16,7 +16,7 @@ import { Learning } from "./model/learning.js";
 import { Lineage } from "./model/lineage.js";
 import { Predict } from "./model/predict.js";
 import { NoteText } from "./model/notes.js";
-import { moveAlias, servingButton } from "./model/serving.js";
+import { moveAlias, rollBack, servingButton, servingReason } from "./model/serving.js";
 import { Versions } from "./model/versions.js";
 
 /** Tabs: name in the address, label, component, selects above the tabs that it uses. */
@@ -77,7 +77,7 @@ function VersionPage({ tab, setTab, wanted, setWanted, ...given }) {
     <//>`;
 }
 
-function Header({ model, where, version, changed }) {
+function Header({ model, aliases: moved, where, version, changed }) {
   const { name, serving_version: serving, aliases } = model, shown = version.version;
   const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
   const { note, tags } = model.versions.find((each) => each.version === shown);
@@ -85,8 +85,12 @@ function Header({ model, where, version, changed }) {
   const serve = async () => {
     if (await moveAlias({ name, where, model }, "serving", version)) changed(`Version ${shown} of ${name} is now serving.`);
   };
-  const other = serving === null ? "no version is serving" : `version ${serving} is serving`;
-  const answers = shown === serving ? `Version ${shown} is serving` : `Viewing version ${shown} · ${other}`;
+  const active = moved.find((each) => each.alias === "serving");
+  const back = async () => {
+    const done = await rollBack({ name, where }, active);
+    if (done) changed(done);
+  };
+  const reason = active ? servingReason(active, model.versions) : "No version is serving.";
   return html`
     <${Heading} text=${name}>
       <div class="actions">
@@ -95,7 +99,8 @@ function Header({ model, where, version, changed }) {
         <${Link} to=${`#/train?model=${encodeURIComponent(name)}`}>Train a new version<//>
       </div>
     <//>
-    <p class="muted">${[answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")}</p>
+    <p class="muted">${[shown === serving ? `Version ${shown}` : `Viewing version ${shown}`, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")}</p>
+    <p class="muted actions">${reason} ${active?.previous && html`<${Button} key=${active.previous} onclick=${back}>Roll back to version ${active.previous}<//>`}</p>
     ${(note || tags.length > 0) && html`<p><${NoteText} note=${note} tags=${tags} /></p>`}`;
 }
 

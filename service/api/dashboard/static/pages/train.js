@@ -33,7 +33,7 @@ function Form({ datasets, models, query }) {
   const rows = given.length === 1 ? rowsOf(query.get("hold_out")) : null;
   const named = rows && { [given[0]]: [rows] };
   const [chosen, setChosen] = useState(given);
-  const [name, setName] = useState(query.get("model") ?? "");
+  const [name, setName] = useState(query.get("model") ?? newName(datasets.find((each) => each.id === given[0]), models));
   const [robot, setRobot] = useState(null); // null: that of the recordings
   const [estimator, setEstimator] = useState("auto");
   const [held, setHeld] = useState({ ...NO_CHANGES, kind: named ? "stretches" : "auto" });
@@ -84,6 +84,12 @@ function Form({ datasets, models, query }) {
     ${problem && (problem.name === "ApiError" ? html`<${ErrorBox} error=${problem} />` : html`<p class="error" role="alert">${problem.message}</p>`)}
     <div class="actions"><button type="submit" class="primary" disabled=${sending}>${sending ? "Starting…" : "Start training"}</button></div>
   </form>`;
+}
+
+/** Return the name of a recording as that of a model; nothing if a model has that name already. */
+function newName(dataset, models) {
+  const name = (dataset?.name ?? "").toLowerCase().replace(/\..*/, "").replace(/[^a-z0-9_-]+/g, "-").replace(/^[^a-z0-9]+/, "").slice(0, 64);
+  return models.some((each) => each.name === name) ? "" : name;
 }
 
 function Name({ value, onchange, models }) {

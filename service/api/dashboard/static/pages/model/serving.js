@@ -1,7 +1,10 @@
 // Let a version serve, after a confirmation: connected robots are affected.
 
-import { put } from "../../api.js";
+import { post, put } from "../../api.js";
 import { confirm } from "../../dialogs.js";
+import { when } from "../../format.js";
+
+const SAME_TIME_MS = 1000; // a version and the move by which it serves at once are stored together
 
 /** Return label and kind of the button that lets a version serve. */
 export function servingButton({ version, verdict }) {
@@ -19,4 +22,23 @@ export async function moveAlias({ name, where, model }, alias, chosen) {
   if ((alias === "serving" || !verdict.serves) && !(await confirm(question, label, kind))) return false;
   await put(`${where}/aliases/${encodeURIComponent(alias)}`, { version, override: !verdict.serves });
   return true;
+}
+
+/** Ask whether an alias should point to its previous version again, and move it; return a notice, or nothing if it stays. */
+export async function rollBack({ name, where }, { alias, version, previous }) {
+  const what = alias === "serving" ? `Version ${previous} of ${name} will serve instead of version ${version}.` : `It will point to version ${previous} again.`;
+  if (!(await confirm(`Roll back the alias “${alias}”? ${what}`, `Roll back to version ${previous}`, "primary"))) return "";
+  const now = await post(`${where}/aliases/${encodeURIComponent(alias)}/rollback`, {});
+  return `${alias} → version ${now.version}`;
+}
+
+/** Return why the serving version serves. serving: the alias. */
+export function servingReason({ version, history: [move] }, versions) {
+  const { created_at: created, promotion, verdict } = versions.find((each) => each.version === version);
+  const isAutomatic = promotion?.answers && Date.parse(move.at) - Date.parse(created) < SAME_TIME_MS;
+  const serves = `Version ${version} is serving`;
+  if (move.rollback) return `${serves}: rolled back from version ${move.before}, ${when(move.at)}.`;
+  if (move.before === null) return `${serves}: no version served before.`;
+  if (isAutomatic) return `${serves}. ${promotion.reason.replace(verdict.reason, "").trim()}`;
+  return `${serves}: promoted instead of version ${move.before}, ${when(move.at)}.`;
 }

@@ -1,6 +1,6 @@
 // Versions and aliases: serve, roll back, export, delete, compare.
 
-import { del, path, post } from "../../api.js";
+import { del, path } from "../../api.js";
 import { Badge, Button, Card, Choice, Field, Listing, Table } from "../../components.js";
 import { ago, when } from "../../format.js";
 import { html, useRef, useState } from "../../preact.js";
@@ -9,7 +9,7 @@ import { VERDICT_HINT, verdictColumns } from "../../verdicts.js";
 import { Compare } from "./compare.js";
 import { exportVersion } from "./export.js";
 import { Note } from "./notes.js";
-import { moveAlias, servingButton } from "./serving.js";
+import { moveAlias, rollBack, servingButton } from "./serving.js";
 
 /** The tab. */
 export function Versions(state) {
@@ -54,11 +54,9 @@ function List({ model, where, aliases, version, view, changed }) {
 }
 
 function Aliases({ model: { name }, where, aliases, changed }) {
-  const back = async ({ alias, version, previous }) => {
-    const what = alias === "serving" ? `Version ${previous} of ${name} will serve instead of version ${version}.` : `It will point to version ${previous} again.`;
-    if (!(await confirm(`Roll back the alias “${alias}”? ${what}`, `Roll back to version ${previous}`, "primary"))) return;
-    const now = await post(`${where}/aliases/${encodeURIComponent(alias)}/rollback`, {});
-    changed(`${alias} → version ${now.version}`);
+  const back = async (each) => {
+    const done = await rollBack({ name, where }, each);
+    if (done) changed(done);
   };
   const remove = async ({ alias, version }) => {
     if (!(await confirm(`Remove the alias “${alias}”? Queries that name it will fail. Version ${version} is kept.`, "Remove alias"))) return;

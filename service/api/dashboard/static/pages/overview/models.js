@@ -21,7 +21,7 @@ export function Models({ shown: { items, next_cursor: cursor, live_after_s: live
 }
 
 function rank(model, live) {
-  const reasons = [model.held, model.failure, model.serving_version !== null && model.verdict.level === "wrong", model.candidate, isLive(model, live)];
+  const reasons = [model.held, model.failure, model.serving_version !== null && model.verdict.level === "wrong", isLive(model, live), model.candidate];
   const first = reasons.findIndex(Boolean);
   return first < 0 ? reasons.length : first;
 }
