@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from tests.service.data import train
 from tests.system.browser.accessibility import audit, expect
 from tests.system.browser.conftest import Dashboard
@@ -13,7 +15,7 @@ NOTE = "old gripper <b>7 kg</b>"
 def test_note_and_tags_are_edited_in_place(visitor: Visitor, dashboard: Dashboard) -> None:
     train(dashboard.client, "noted", dashboard.dataset["id"])
     page = visitor.open("#/models/noted?tab=versions")
-    edit = page.get_by_role("button", name="Edit note: version 1")
+    edit = page.get_by_role("button", name=re.compile("^(Add|Edit) note: version 1$"))
 
     def stored() -> list[object]:
         version = dashboard.client.get("/v1/models/noted/versions/1").json()

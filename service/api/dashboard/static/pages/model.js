@@ -6,6 +6,7 @@ import { when } from "../format.js";
 import { JointVerdicts } from "../jointverdicts.js";
 import { html, useEffect, useRef, useState } from "../preact.js";
 import { notice } from "../dialogs.js";
+import { Prose } from "../prose.js";
 import { VerdictNote } from "../verdicts.js";
 import { Warnings } from "../warnings.js";
 import { Accuracy } from "./model/accuracy.js";
@@ -100,7 +101,7 @@ function Header({ model, aliases: moved, where, version, changed }) {
       </div>
     <//>
     <p class="muted">${[shown === serving ? `Version ${shown}` : `Viewing version ${shown}`, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")}</p>
-    <p class="muted actions">${reason} ${active?.previous && html`<${Button} key=${active.previous} onclick=${back}>Roll back to version ${active.previous}<//>`}</p>
+    <p class="muted actions"><span><${Prose} text=${reason} /></span> ${active?.previous && html`<${Button} key=${active.previous} onclick=${back}>Roll back to version ${active.previous}<//>`}</p>
     ${(note || tags.length > 0) && html`<p><${NoteText} note=${note} tags=${tags} /></p>`}`;
 }
 

@@ -11,7 +11,7 @@ export function NoteText({ note, tags }) {
 
 /** The note and the tags of a version with a button that opens the form. changed(text): after they are saved. */
 export function Note({ where, version, changed }) {
-  const { version: number, note, tags } = version;
+  const { version: number, note, tags } = version, verb = note || tags.length ? "Edit" : "Add";
   const [open, setOpen] = useState(false), cell = useRef(null), before = useRef(false);
   useEffect(() => {
     if (open !== before.current) cell.current.querySelector(open ? "textarea" : "button").focus();
@@ -26,7 +26,7 @@ export function Note({ where, version, changed }) {
   if (open) return html`<div class="note-cell" ref=${cell}><${Form} note=${note} tags=${tags} save=${save} close=${close} /></div>`;
   return html`<div class="note-cell" ref=${cell}>
     <${NoteText} note=${note} tags=${tags} />
-    <${Button} label=${`Edit note: version ${number}`} onclick=${() => setOpen(true)}>${note || tags.length ? "Edit" : "Add"}<//>
+    <${Button} label=${`${verb} note: version ${number}`} onclick=${() => setOpen(true)}>${verb}<//>
   </div>`;
 }
 
