@@ -408,7 +408,8 @@ def print_verdict(title: str, verdict: Verdict) -> None:
 def print_judged(version: VersionRecord) -> None:
     """Print the verdict on a version, and why it does not serve although it is usable."""
     held: dict[str, Any] = version.lineage.get("holdout") or {}
-    print_verdict(counted(held.get("samples", 0), "held-out sample"), version.verdict)
+    samples = held.get("samples", 0)
+    print_verdict(counted(samples, "held-out sample") if samples else "verdict by joint", version.verdict)
     if held.get("learnt"):
         echo("  Evaluated on held-out rows; the version was then trained on all rows.")
     if (curve := held.get("learning_curve")) is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import tempfile
 import threading
@@ -136,16 +137,21 @@ def learnt_figures(learnt: StreamLearnt) -> dict[str, Any]:
 
 
 def refused_figures(refusals: Sequence[StreamRefusal]) -> list[dict[str, Any]]:
-    """Return torques that were not logged, for JSON; consecutive ones with the same message are merged."""
+    """Return torques that were not logged, for JSON.
+
+    Consecutive ones are merged if their messages differ at most in numbers; the first message is kept.
+    """
     merged: list[dict[str, Any]] = []
     for each in refusals:
-        if merged and (merged[-1]["through"] + 1, merged[-1]["message"]) == (each.first, each.message):
+        kind = (each.first - 1, each.code, NUMBER.sub("", each.message))
+        if merged and (merged[-1]["through"], merged[-1]["code"], NUMBER.sub("", merged[-1]["message"])) == kind:
             merged[-1]["through"] = each.through
         else:
             merged.append({"first": each.first, "through": each.through, "code": each.code, "message": each.message})
     return merged
 
 
+NUMBER = re.compile(r"\d+")
 MIN_ROWS = 10
 """Min rows of a recording."""
 

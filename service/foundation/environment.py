@@ -99,8 +99,13 @@ def check_environment(environment: Mapping[str, str]) -> list[str]:
     for name in sorted(names):
         short = name.removeprefix(PREFIX)
         if short in REMOVED_VARIABLES:
-            warnings.append(f"{name} was removed: {REMOVED_VARIABLES[short]}.")
+            warnings.append(removal(short))
         elif short not in OTHER_VARIABLES and short not in known and not name.startswith(foreign):
             near = get_close_matches(short, known, 1)
             raise ValueError(f"Unknown setting {name}." + (f" Did you mean {PREFIX}{near[0]}?" if near else ""))
     return warnings
+
+
+def removal(name: str) -> str:
+    """Return what replaces a removed variable, as a sentence. name: without the prefix."""
+    return f"{PREFIX}{name} was removed: {REMOVED_VARIABLES[name]}."

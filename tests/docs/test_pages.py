@@ -12,6 +12,10 @@ from service.cli.main import app
 from tests.docs.blocks import ROOT, all_pages, blocks, pages, prose
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
+DASHBOARD = ROOT / "service/api/dashboard/static"
+TERM = re.compile(r'\b(?:of|term)(?:=|: )"([\w-]+)"')
+"""A word of the dashboard with the anchor of its definition: `Term`, or `term` of a card or column."""
+GUIDE_LINK = re.compile(r"/guide/([\w/-]*)(?:#([\w-]+))?[\"`]")
 MAX_LINE_LENGTH, MAX_WORDS = 120, 15_000
 """Characters of a line of prose, without tables and code; words of all hand-written pages, as `wc -w` counts them."""
 HEADINGS = re.compile(r"^#+ +(.*?)\s*$", re.MULTILINE)
@@ -33,6 +37,20 @@ def test_links_have_targets(page):
         assert target.is_relative_to(ROOT), f"{page.name}: {link}"
         assert target.exists(), f"{page.name}: {link}"
         assert not fragment or fragment in anchors(target), f"{page.name}: {link}"
+
+
+def test_dashboard_links_to_definitions_and_pages_that_exist():
+    texts = {path.name: path.read_text("utf-8") for path in DASHBOARD.rglob("*") if path.suffix in (".js", ".html")}
+    terms = {(name, term) for name, text in texts.items() for term in TERM.findall(text)}
+    defined = anchors(ROOT / "docs/glossary.md")
+    assert {name for name, _ in terms} >= {"verdicts.js", "innovation.js", "lineage.js"}
+    assert {(name, term) for name, term in terms if term not in defined} == set()
+    links = [each for text in texts.values() for each in GUIDE_LINK.findall(text)]
+    assert links
+    for address, fragment in links:
+        page = ROOT / "docs" / f"{address.rstrip('/') or 'README'}.md"
+        assert page.exists(), address
+        assert not fragment or fragment in anchors(page), f"{address}#{fragment}"
 
 
 @pytest.mark.parametrize("name", ["api", "archives", "stream"])

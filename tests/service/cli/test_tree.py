@@ -58,6 +58,29 @@ def test_settings_are_listed_with_units_and_without_passwords(lipserve, monkeypa
     assert shown["LIPSERVE_PUBLISH_EVERY_S"].items() >= publish.items()
 
 
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["home_bytes"], ["LIPSERVE_MAX_HOME_BYTES"]),  # part of the name
+        (["Quota", "of the home"], ["LIPSERVE_MAX_HOME_BYTES"]),  # words of the meaning
+        (["lipserve_max_home_bytes"], ["LIPSERVE_MAX_HOME_BYTES"]),
+        (["max_refreshed"], []),  # removed
+    ],
+)
+def test_settings_are_found_by_name_or_meaning(lipserve, words, found):
+    code, out, _ = lipserve("settings", *words, "--json")
+    assert (code, [each["variable"] for each in json.loads(out)]) == (0, found)
+
+
+def test_search_for_setting_explains_removed_and_unknown_ones(lipserve):
+    assert lipserve("settings", "max_refreshed")[2].split() == (
+        ["LIPSERVE_MAX_REFRESHED_VERSIONS", "was", "removed:", "10", "refreshed", "versions", "of", "a", "model", "are", "now", "kept."]
+    )
+    code, out, err = lipserve("settings", "home", "no-such-word")
+    assert (code, out) == (1, "")
+    assert "`home no-such-word`" in err
+
+
 @pytest.fixture
 def completed(lipserve, monkeypatch):
     """Return the completions of the last word of a command line."""

@@ -57,9 +57,14 @@ export function Heading({ text, children }) {
   return html`<div class="heading"><h1>${text}</h1>${children && html`<div class="actions">${children}</div>`}</div>`;
 }
 
-/** A section of a page with a title. */
-export function Card({ title, kind = "", children }) {
-  return html`<section class=${`card ${kind}`.trim()} aria-label=${title}><h2>${title}</h2>${children}</section>`;
+/** A section of a page with a title. term: the anchor of its definition in the glossary. */
+export function Card({ title, term, kind = "", children }) {
+  return html`<section class=${`card ${kind}`.trim()} aria-label=${title}><h2>${term ? html`<${Term} of=${term}>${title}<//>` : title}</h2>${children}</section>`;
+}
+
+/** A word with a link to its definition. of: the anchor in the glossary of the guide. */
+export function Term({ of, children }) {
+  return html`<a class="term" href=${`/guide/glossary/#${of}`}>${children}</a>`;
 }
 
 /** A badge for a state, with a symbol so that colour is not the only cue. */
@@ -139,7 +144,7 @@ export function ErrorBox({ error, retry }) {
   </div>`;
 }
 
-/** A table that scrolls horizontally if it is too wide. columns: [{label, cell: row => content, numeric}]; identity(row, index): its key. */
+/** A table that scrolls horizontally if it is too wide. columns: [{label, term, cell: row => content, numeric}], with the `of` of a `Term`; identity(row, index): its key. */
 export function Table({ columns, rows, caption, identity = (_row, index) => index }) {
   const kind = (column) => (column.numeric ? "numeric" : undefined);
   const name = caption ?? columns.map((column) => column.label).join(", ");
@@ -147,7 +152,7 @@ export function Table({ columns, rows, caption, identity = (_row, index) => inde
     ${caption && html`<p class="caption" aria-hidden="true">${caption}</p>`}
     <div class="scroll" tabindex="0" role="region" aria-label=${name}>
       <table aria-label=${name}>
-        <thead><tr>${columns.map((column) => html`<th scope="col" class=${kind(column)}>${column.label}</th>`)}</tr></thead>
+        <thead><tr>${columns.map((column) => html`<th scope="col" class=${kind(column)}>${column.term ? html`<${Term} of=${column.term}>${column.label}<//>` : column.label}</th>`)}</tr></thead>
         <tbody>${rows.map((row, index) => html`<tr key=${identity(row, index)} data-key=${identity(row, index)}>${columns.map((column) => html`<td class=${kind(column)}>${column.cell(row)}</td>`)}</tr>`)}</tbody>
       </table>
     </div>

@@ -1,5 +1,6 @@
 // The verdict on each joint: its error against the range of its torque, its coverage, the width of its intervals.
 
+import { Term } from "./components.js";
 import { count, number, percent, shortNames } from "./format.js";
 import { Joint } from "./jointbars.js";
 import { html } from "./preact.js";
@@ -19,9 +20,9 @@ export function JointVerdicts({ verdict: { joints } }) {
     </div>
     <details class="hint">
       <summary>How to read this</summary>
-      <p>Error: its bar ends at the range of the torque${joints.some((each) => range(each) === null) ? `, or, where that is unknown, at ${MEANS} times the error of the mean torque` : ""}. The mark is the error of the mean torque, which needs no model.</p>
-      <p>95 % coverage: the share of the measurements inside the 95 % interval, from ${percent(LEAST, 0)} to 100 %. It should end at the mark. The thin line is its 95 % confidence interval.</p>
-      <p>Width ÷ need: the width of the 95 % interval, relative to that of errors as large as the RMSE. It should be near 1.</p>
+      <p>Error (<${Term} of="rmse">RMSE<//>): its bar ends at the range of the torque${joints.some((each) => range(each) === null) ? `, or, where that is unknown, at ${MEANS} times the error of the mean torque` : ""}. The mark is the error of the mean torque, which needs no model.</p>
+      <p>95 % <${Term} of="coverage">coverage<//>, from ${percent(LEAST, 0)} to 100 %. It should end at the mark. The thin line is its 95 % confidence interval.</p>
+      <p><${Term} of="width">Width ÷ need<//>: it should be near 1.</p>
     </details>`;
 }
 

@@ -1,6 +1,6 @@
 // The verdict on a version as components: badge, note, columns of lists.
 
-import { Badge } from "./components.js";
+import { Badge, Term } from "./components.js";
 import { percent } from "./format.js";
 import { html } from "./preact.js";
 import { Prose } from "./prose.js";
@@ -23,7 +23,9 @@ export function VerdictNote({ verdict, about = "" }) {
 }
 
 /** Explanation of the columns, shown below a list. */
-export const VERDICT_HINT = "Verdict: whether the torque can be used. Error: the largest RMSE of a joint, as a share of the range of its torque. 95\u00a0% coverage: share of the measurements inside the 95\u00a0% interval, the smallest of the joints. All are evaluated on held-out rows, before the version is trained on all rows.";
+export function VerdictHint() {
+  return html`<p class="hint"><${Term} of="verdict">Verdict<//>: whether the torque can be used. Error: the largest <${Term} of="rmse">RMSE<//> of a joint, as a share of the range of its torque. 95\u00a0% <${Term} of="coverage">coverage<//>: the smallest of the joints. All are evaluated on <${Term} of="held-out">held-out<//> rows, before the version is trained on all rows.</p>`;
+}
 
 /** Columns of a list. of(row): the verdict of the row's version; null without a version. */
 export function verdictColumns(of) {

@@ -4,7 +4,7 @@ import { get } from "../api.js";
 import { Await, Badge, Button, Card, Empty, Heading, Link, Listing, page, Progress, useRead } from "../components.js";
 import { ago, percent, seconds, sentence, when } from "../format.js";
 import { html, useEffect, useState } from "../preact.js";
-import { VERDICT_HINT, verdictColumns } from "../verdicts.js";
+import { VerdictHint, verdictColumns } from "../verdicts.js";
 import { ACTIVE, remaining, stage } from "./job/words.js";
 
 const PERIOD_S = 2;
@@ -40,7 +40,7 @@ function List({ newest, older, setOlder, signal }) {
   const words = (job) => [job.model, job.state, job.estimator, job.id].join(" ");
   return html`
     <${Listing} columns=${COLUMNS} rows=${jobs} caption="Jobs" what=${["job", "jobs"]} identity=${(job) => job.id} words=${words} />
-    <p class="hint">${VERDICT_HINT}</p>
+    <${VerdictHint} />
     ${cursor && html`<${Button} onclick=${more}>Show older<//>`}`;
 }
 

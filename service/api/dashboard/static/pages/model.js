@@ -1,7 +1,7 @@
 // One model: its verdict, accuracy, components, arm, versions, lineage, predictions and online learning.
 
 import { get, pages, path } from "../api.js";
-import { Await, Badge, Button, Heading, Link, page, Tabs, useRead } from "../components.js";
+import { Await, Badge, Button, Heading, Link, page, Tabs, Term, useRead } from "../components.js";
 import { when } from "../format.js";
 import { JointVerdicts } from "../jointverdicts.js";
 import { html, useEffect, useRef, useState } from "../preact.js";
@@ -110,7 +110,7 @@ function Verdict({ version, open }) {
   return html`<section class="card" aria-label="Verdict">
     <${VerdictNote} verdict=${verdict} />
     ${promotion?.answers && !verdict.serves && html`<p class="hint">Version ${version.version} was promoted, although it is ${verdict.label}.</p>`}
-    ${promotion && !promotion.answers && verdict.serves && html`<p class="banner" role="note"><strong>Version ${version.version} is a candidate.</strong> ${promotion.reason}</p>`}
+    ${promotion && !promotion.answers && verdict.serves && html`<p class="banner" role="note"><strong>Version ${version.version} is a <${Term} of="candidate">candidate<//>.</strong> ${promotion.reason}</p>`}
     <${Warnings} texts=${warnings} />
     ${verdict.joints.length > 0 && html`<details class="by-joint" open=${open}><summary>Joints</summary><${JointVerdicts} verdict=${verdict} /></details>`}
   </section>`;

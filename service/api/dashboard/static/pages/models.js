@@ -4,7 +4,7 @@ import { pages } from "../api.js";
 import { Await, Card, Empty, Heading, Link, Listing, page, useRead } from "../components.js";
 import { ago, count, when } from "../format.js";
 import { html, useEffect } from "../preact.js";
-import { VERDICT_HINT, verdictColumns } from "../verdicts.js";
+import { VerdictHint, verdictColumns } from "../verdicts.js";
 
 const MAX_MODELS = 500;
 const COLUMNS = [
@@ -30,7 +30,7 @@ function List({ models }) {
     <${Heading} text="Models"><${Link} to="#/train" kind="primary">Train a model<//><//>
     <${Card} title="All models">
       <${Listing} columns=${COLUMNS} rows=${models} caption="Models" what=${["model", "models"]} identity=${(model) => model.name} words=${words} />
-      <p class="hint">${VERDICT_HINT}</p>
+      <${VerdictHint} />
       ${models.length === MAX_MODELS && html`<p class="hint">Showing the newest ${MAX_MODELS} models.</p>`}
     <//>`;
 }

@@ -51,7 +51,7 @@ export function AxisTable({ version: { joint_names: names, parameters: { geometr
     numeric("± shift, mm", (place) => stds(joints[place].shift_std, 1000)),
     numeric("Centre of mass, m", (place) => vector(centre[order[place]])),
     numeric("±, mm", (place) => spread(inertia.bodies[order[place]], centre[order[place]]).map((each) => number(1000 * each, 2)).join(", ")),
-    { label: "Unidentifiable", cell: (place) => unknown(place) || "–" },
+    { label: "Unidentifiable", term: "identifiability", cell: (place) => unknown(place) || "–" },
   ];
   return html`<div class="dense"><${Table} columns=${columns} rows=${joints.map((_joint, place) => place)} caption="Axes in the base frame, with all positions at zero; centres of mass in the frames of their joints; ±: one standard deviation" /></div>`;
 }

@@ -93,7 +93,7 @@ function Friction({ found, joints }) {
     { label: "Coulomb friction", cell: weight("coulomb") },
     { label: "Constant torque", cell: weight("offset") },
   ];
-  return html`<${Card} title="Identifiability of friction"><${Table} columns=${columns} rows=${found.joints} caption=${`Estimated together with ${beside}; ±: one standard deviation`} /><//>`;
+  return html`<${Card} title="Identifiability of friction" term="identifiability"><${Table} columns=${columns} rows=${found.joints} caption=${`Estimated together with ${beside}; ±: one standard deviation`} /><//>`;
 }
 
 function AgainstRobot({ found, joints }) {

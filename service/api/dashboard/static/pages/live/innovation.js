@@ -20,7 +20,7 @@ const MAX_MARKS = 150; // of each kind
 export function Innovation({ shown, joints, window, threshold, joint, linked }) {
   const range = [-span(shown, window), 0];
   const label = `Innovation of all joints over the last ${-range[0]} seconds, with marks of rejected rows`;
-  return html`<${Card} title="Innovation">
+  return html`<${Card} title="Innovation" term="innovation">
     <${LivePlot} make=${() => innovation(shown, joints, range, threshold, joint)} inputs=${[shown, joint]} height=${HEIGHT} label=${label} linked=${linked} />
     <${Explanation}>Measured − predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rejected rows and rows outside the training data, at the joint with the largest innovation. Values beyond ± ${MAX_RANGE_STD} are drawn at ± ${MAX_RANGE_STD}.<//>
   <//>`;

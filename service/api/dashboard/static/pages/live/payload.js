@@ -43,7 +43,7 @@ export function Payload({ payloads, checking }) {
     { label: "Payload", cell: (each) => html`<strong>${mass(each)}</strong>` },
     { label: "State", cell: state },
   ];
-  return html`<${Card} title="Payload">
+  return html`<${Card} title="Payload" term="payload">
     ${inContact.length > 0 && html`<p><${Badge} state=${`contact on ${inContact.join(", ")}: no payload explains the torque`} kind="warn" /></p>`}
     ${payloads.length === 1 ? html`<p class="big">${mass(only)}</p><p class="row">${state(only)}</p>` : html`<${Table} columns=${columns} rows=${payloads} caption="Payload by stream" identity=${(each) => each.stream_id} />`}
     <${Explanation} first=${NO_SAFETY}>Mass at the tip, in addition to the mass during training; ± one standard deviation. Predictions include it. A payload looks like a contact at first, so it is checked for up to ${CHECK_S} s. If the arm was learnt without a URDF, the mass is only as accurate as the learnt lengths.<//>

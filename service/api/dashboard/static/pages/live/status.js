@@ -39,9 +39,9 @@ export function Quality({ status: { windows: [latest], joint_names: names, joint
   };
   const columns = [
     { label: "Joint", cell: (joint) => short[joint] },
-    { label: "RMSE", numeric: true, cell: (joint) => `${number(latest.rmse[joint], 2)}\u00a0${torqueUnit(types[joint])}` },
+    { label: "RMSE", term: "rmse", numeric: true, cell: (joint) => `${number(latest.rmse[joint], 2)}\u00a0${torqueUnit(types[joint])}` },
     { label: "of range", numeric: true, cell: share },
-    { label: `${percent(level, 0)} coverage`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
+    { label: `${percent(level, 0)} coverage`, term: "coverage", numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
     { label: "served", numeric: true, cell: (joint) => percent(latest.coverage_answered[joint]) },
     { label: "factor", numeric: true, cell: (joint) => `×\u00a0${number(scale[joint], 2)}` },
   ];

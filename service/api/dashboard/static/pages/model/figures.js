@@ -1,6 +1,6 @@
 // Figures of an evaluation: table by joint, nMSE by segment, reliability curve.
 
-import { Card, Table } from "../../components.js";
+import { Card, Table, Term } from "../../components.js";
 import { Export } from "../../exporting.js";
 import { count, counted, number, percent, scientific, sentence, shortNames } from "../../format.js";
 import { Joint, JointKey } from "../../jointbars.js";
@@ -27,7 +27,7 @@ export function AllFigures({ evaluation }) {
   return html`<${Card} title="All figures">
     ${warnings.map((text) => html`<p class="banner" role="note">${sentence(text)}</p>`)}
     <${Table} columns=${columns} rows=${joints.map((_name, joint) => joint)} caption=${`On ${used} samples${stretches.kind === "episodes" ? `, ${counted(stretches.samples.length, "episode")}` : ""}`} />
-    <p class="hint">nMSE: mean squared error / variance of the measured torque. 1 is no better than the mean torque; if the torque is mostly noise, nMSE cannot be near 0.</p>
+    <p class="hint"><${Term} of="nmse">nMSE<//>: if the torque is mostly noise, nMSE cannot be near 0.</p>
   <//>`;
 }
 

@@ -1,7 +1,7 @@
 // Online learning of a model: state, recent quality, alarms, settings.
 
 import { get } from "../../api.js";
-import { Badge, Card, Empty, ErrorBox, Facts, Link, Loading, Table, useRead } from "../../components.js";
+import { Badge, Card, Empty, ErrorBox, Facts, Link, Loading, Table, Term, useRead } from "../../components.js";
 import { ago, count, counted, number, percent, scientific, seconds, sentence, shortNames, when } from "../../format.js";
 import { Joint } from "../../jointbars.js";
 import { html } from "../../preact.js";
@@ -28,10 +28,10 @@ function State({ options, status: at, name }) {
   if (!at.events) return html`<${Empty} text=${options.enabled ? "Nothing learnt online yet. Send measured torque by a stream or in observation batches." : "Learning is paused."}>${live}<//>`;
   const pairs = [
     ["Learning version", String(at.version)],
-    ["Serving revision", html`${count(at.published)} ${at.lag_events ? html`<${Badge} state=${`${counted(at.lag_events, "event")} behind`} kind="busy" />` : html`<${Badge} state="up to date" kind="good" />`}`],
+    [html`Serving <${Term} of="revision">revision<//>`, html`${count(at.published)} ${at.lag_events ? html`<${Badge} state=${`${counted(at.lag_events, "event")} behind`} kind="busy" />` : html`<${Badge} state="up to date" kind="good" />`}`],
     ["Observation batches logged", count(at.events)],
     ["Rows outside the training data", percent(at.novel_share)],
-    ...(at.linearisation_error ? [["Linearisation error of the arm", `${percent(Math.max(...at.linearisation_error))} of the stated standard deviation`]] : []),
+    ...(at.linearisation_error ? [[html`<${Term} of="linearisation">Linearisation<//> error of the arm`, `${percent(Math.max(...at.linearisation_error))} of the stated standard deviation`]] : []),
     ["Streams", at.streams.length ? at.streams.map((each) => each.stream_id).join(", ") : "none"],
   ];
   return html`<${Card} title="State">
@@ -47,9 +47,9 @@ function Quality({ joint_names: names, windows, level }) {
   const short = shortNames(names);
   const columns = [
     { label: "Joint", cell: (joint) => html`<${Joint} index=${joint} name=${short[joint]} />` },
-    { label: "nMSE", numeric: true, cell: (joint) => scientific(newest.nmse[joint]) },
-    { label: "RMSE, N·m", numeric: true, cell: (joint) => number(newest.rmse[joint]) },
-    { label: `${percent(level, 0)} coverage`, numeric: true, cell: (joint) => percent(newest.coverage[joint]) },
+    { label: "nMSE", term: "nmse", numeric: true, cell: (joint) => scientific(newest.nmse[joint]) },
+    { label: "RMSE, N·m", term: "rmse", numeric: true, cell: (joint) => number(newest.rmse[joint]) },
+    { label: `${percent(level, 0)} coverage`, term: "coverage", numeric: true, cell: (joint) => percent(newest.coverage[joint]) },
   ];
   const rejected = Object.entries(newest.rejected).filter(([, rows]) => rows).map(([code, rows]) => `${code} ${count(rows)}`);
   return html`<${Card} title="Recent quality">

@@ -1,6 +1,6 @@
 // Lineage of a version: data, held-out part, options, fit, software.
 
-import { Badge, Card, Facts, Link, Table } from "../../components.js";
+import { Badge, Card, Facts, Link, Table, Term } from "../../components.js";
 import { bytes, count, number, percent, scientific, seconds, shortNames, when } from "../../format.js";
 import { Joint } from "../../jointbars.js";
 import { html } from "../../preact.js";
@@ -56,7 +56,7 @@ function TrainedOn({ from, datasets }) {
   const columns = [
     { label: "Data set", cell: (row) => (known.has(row.id) ? html`<${Link} to=${`#/data/${row.id}`}>${row.name || row.id}<//>` : `${row.name || row.id} (deleted)`) },
     { label: "Samples", numeric: true, cell: (row) => count(row.rows) },
-    { label: "Held out", numeric: true, cell: (row) => (held(row) ? `${count(held(row).rows)}${held(row).whole ? " (all)" : ""}` : "–") },
+    { label: "Held out", term: "held-out", numeric: true, cell: (row) => (held(row) ? `${count(held(row).rows)}${held(row).whole ? " (all)" : ""}` : "–") },
     { label: "Guard (unused)", numeric: true, cell: (row) => (held(row) ? count(held(row).guarded) : "–") },
     { label: "SHA-256", cell: (row) => html`<code title=${row.sha256}>${row.sha256?.slice(0, 12) ?? "–"}</code>` },
   ];
@@ -95,7 +95,7 @@ function fitFacts({ fit: report, compact, calibration, conformal, lineage: from 
     ["Samples", count(report.samples_given)],
     ["Samples for the hyperparameters", count(report.samples_hyperparameters)],
     ["Samples for the posterior", count(report.samples_posterior)],
-    ["Effective samples", count(report.independent_samples)],
+    [html`<${Term} of="effective-samples">Effective samples<//>`, count(report.independent_samples)],
     ["Calibration factor of the model’s std", number(calibration.function_std_factor)],
   ];
   if (conformal) {
@@ -111,7 +111,7 @@ function fitFacts({ fit: report, compact, calibration, conformal, lineage: from 
   }
   if (compact) {
     found.push(
-      ["Inducing outputs", count(compact.inducing_outputs)],
+      [html`<${Term} of="inducing-outputs">Inducing outputs<//>`, count(compact.inducing_outputs)],
       ["Max deviation from the exact mean", `${percent(compact.mean_max)} of its std`],
       ["Max deviation from the exact std", percent(compact.std_max)],
       ["Tolerance reached", html`<${Badge} state=${compact.tolerance_reached ? "yes" : "no: tau_std is too large"} kind=${compact.tolerance_reached ? "good" : "warn"} />`],

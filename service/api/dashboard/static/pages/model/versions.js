@@ -5,7 +5,7 @@ import { Badge, Button, Card, Choice, Field, Listing, Table } from "../../compon
 import { ago, when } from "../../format.js";
 import { html, useRef, useState } from "../../preact.js";
 import { confirm } from "../../dialogs.js";
-import { VERDICT_HINT, verdictColumns } from "../../verdicts.js";
+import { VerdictHint, verdictColumns } from "../../verdicts.js";
 import { Compare } from "./compare.js";
 import { exportVersion } from "./export.js";
 import { Note } from "./notes.js";
@@ -14,8 +14,8 @@ import { moveAlias, rollBack, servingButton } from "./serving.js";
 /** The tab. */
 export function Versions(state) {
   return html`
-    <${Card} title="Versions"><${List} ...${state} /><p class="hint">${VERDICT_HINT}</p><//>
-    <${Card} title="Aliases"><${Aliases} ...${state} /><${AliasForm} ...${state} /><//>
+    <${Card} title="Versions"><${List} ...${state} /><${VerdictHint} /><//>
+    <${Card} title="Aliases" term="alias"><${Aliases} ...${state} /><${AliasForm} ...${state} /><//>
     ${state.model.versions.length > 1 && html`<${Card} title="Compare versions"><${Compare} ...${state} /><//>`}`;
 }
 
