@@ -73,9 +73,8 @@ def test_settings_are_found_by_name_or_meaning(lipserve, words, found):
 
 
 def test_search_for_setting_explains_removed_and_unknown_ones(lipserve):
-    assert lipserve("settings", "max_refreshed")[2].split() == (
-        ["LIPSERVE_MAX_REFRESHED_VERSIONS", "was", "removed:", "10", "refreshed", "versions", "of", "a", "model", "are", "now", "kept."]
-    )
+    notice = " ".join(lipserve("settings", "max_refreshed")[2].split())
+    assert notice.startswith("LIPSERVE_MAX_REFRESHED_VERSIONS was removed: 10 refreshed versions")
     code, out, err = lipserve("settings", "home", "no-such-word")
     assert (code, out) == (1, "")
     assert "`home no-such-word`" in err
