@@ -14,8 +14,8 @@ from lipserve.address import DEFAULT_URL
 from lipserve.call import given
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, out, print_json, print_warnings
-from service.cli.models import print_verdict
 from service.cli.options import Data, Json, ModelVersion, Url, alone, group, names, numbers
+from service.cli.versions import print_verdict
 from service.foundation.text import counted
 
 predict_app = alone()

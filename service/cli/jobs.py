@@ -15,8 +15,8 @@ from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, robot_of, urdf_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json, print_warnings
-from service.cli.models import print_judged, print_selection
 from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Promotion, Url, alone, group, names, pairs, value
+from service.cli.versions import print_judged, print_selection
 from service.foundation.text import percent
 
 if TYPE_CHECKING:

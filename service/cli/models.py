@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.markup import escape
@@ -16,15 +16,13 @@ from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
 from service.cli.options import Data, Json, Limit, Model, ModelVersion, Promotion, Url, Yes, confirm, group
-from service.cli.wording import in_shell
+from service.cli.versions import print_version
 from service.foundation.text import counted, percent
 
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
-    from lipserve.records.models import AliasMove, Selection
+    from lipserve.records.models import AliasMove
     from lipserve.records.models import Model as ModelRecord
-    from lipserve.records.verdicts import Verdict
-    from lipserve.results.arm import Version as VersionRecord
     from service.contract.states import PromotionOption
 
 app = group("List, show, promote, roll back, alias, compare, export, import and delete models.")
@@ -105,7 +103,7 @@ def show(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> 
         words = escape(" ".join([each.note or "", *(f"[{tag}]" for tag in each.tags)]).strip()) or "-"
         table.add_row(str(each.version), *cells, each.estimator, at, escape(", ".join(named)) or "-", *[words] * noted)
     out.print(table)
-    _print_version(detail)
+    print_version(detail)
 
 
 @app.command()
@@ -382,91 +380,3 @@ def _moved(model: str, moved: AliasRecord, as_json: bool) -> None:
     echo(f"{moved.alias} → {model} version {moved.version}")
     if moved.previous is not None:
         note(f"`lipserve models rollback {model} --alias {moved.alias}` returns to version {moved.previous}")
-
-
-def print_selection(selection: Selection) -> None:
-    """Print the comparison of estimators and the one that was selected."""
-    from service.cli.tables import selection_table  # noqa: PLC0415 - slow import, not needed for help
-
-    out.print(selection_table(selection))
-    echo(f"  selected {selection.chosen}: {selection.reason}")
-    if selection.held_out.repeats:
-        echo("  held-out motion repeats training motion: figures are too optimistic, except at the edge")
-
-
-def print_verdict(title: str, verdict: Verdict) -> None:
-    """Print a verdict: figures joint by joint, then its level, why, and what to do."""
-    from service.cli.tables import verdict_table  # noqa: PLC0415 - slow import, not needed for help
-
-    if verdict.joints:
-        out.print(verdict_table(title, verdict))
-    echo(f"{verdict.label}: {in_shell(verdict.reason)}")
-    if verdict.level != "usable":
-        echo(f"  {in_shell(verdict.action)}")
-
-
-def print_judged(version: VersionRecord) -> None:
-    """Print the verdict on a version, and why it does not serve although it is usable."""
-    held: dict[str, Any] = version.lineage.get("holdout") or {}
-    samples = held.get("samples", 0)
-    print_verdict(counted(samples, "held-out sample") if samples else "verdict by joint", version.verdict)
-    if held.get("learnt"):
-        echo("  Evaluated on held-out rows; the version was then trained on all rows.")
-    if (curve := held.get("learning_curve")) is not None:
-        echo(f"  {curve['text']}")
-    promotion = version.promotion
-    if promotion is not None and not promotion.answers and version.verdict.serves:
-        print_warnings([promotion.reason])
-
-
-def _print_guarantee(conformal: dict[str, Any]) -> None:
-    """Print the coverage that cross-conformal calibration guarantees."""
-    least, widest = min(conformal["guaranteed"]), max(conformal["scale"])
-    blocks = "1 block" if conformal["blocks"] == 1 else f"{conformal['blocks']} blocks"
-    wider = "not widened" if widest == 1 else f"widened up to {widest:.2f} times"
-    few = "; more blocks would guarantee 95 %" if least < 0.95 - 1e-9 else ""
-    echo(f"  intervals {wider}: {blocks} left out in turn guarantee coverage {100 * least:.0f} % on such motion{few}")
-
-
-def print_of_joints(version: VersionRecord) -> None:
-    """Print what the fit reports joint by joint."""
-    joints = {
-        "right_angle_": "probability that the axis is at a right angle",
-        "local_": "remaining squared error after local correction",
-        "widened_": "factor on interval width from held-out data",
-        "zero_": "zero position in degrees (mm)",
-    }
-    for prefix, text in joints.items():
-        numbered = ((key.removeprefix(prefix), value) for key, value in version.fit.items() if key.startswith(prefix))
-        found = {int(number): value for number, value in numbered if number.isdecimal()}  # not `local_nats`
-        if found:
-            echo(f"  {text}: {', '.join(f'{version.joint_names[j - 1]} {found[j]:.2g}' for j in sorted(found))}")
-
-
-def _print_version(version: VersionRecord) -> None:
-    names = version.joint_names
-    echo(f"version {version.version}: {version.estimator}, {counted(len(names), 'joint')}: {', '.join(names)}")
-    noise = ", ".join(f"{value:.3g}" for value in version.noise_std)
-    echo(f"  torque {version.torque_convention.replace('_', ' ')}, measurement noise {noise} N·m")
-    if version.selection is not None:
-        print_selection(version.selection)
-    lineage: dict[str, Any] = version.lineage
-    sets = [each.get("name") or each.get("id") for each in lineage.get("datasets") or () if isinstance(each, dict)]
-    if sets:
-        echo(f"  trained on {', '.join(map(str, sets))}")
-    if (independent := version.fit.get("independent_samples")) is not None:
-        echo(f"  {counted(version.fit['samples_given'], 'sample')}, {round(independent):,} effective")
-    if version.conformal is not None:
-        _print_guarantee(version.conformal)
-    print_of_joints(version)
-    print_judged(version)
-    print_warnings(version.warnings)
-    arm = version.arm
-    if arm is not None:
-        from lipserve.results.arm import LIMITS  # noqa: PLC0415
-        from service.cli.tables import arm_tables  # noqa: PLC0415 - as above
-
-        for table in arm_tables(arm):
-            out.print(table)
-        for text in LIMITS:
-            echo(text)

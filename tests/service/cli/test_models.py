@@ -6,7 +6,7 @@ import pytest
 
 from lipcore.robots.urdf import describe
 from lipserve.records.models import Selection, SelectionCandidate, SelectionHeldOut
-from service.cli.models import print_of_joints, print_selection
+from service.cli.versions import print_of_joints, print_selection
 from tests.service.cli.conftest import lacking
 from tests.service.models.versions import JOINTS, WARNING
 

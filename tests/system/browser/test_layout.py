@@ -1,4 +1,4 @@
-"""Check that no page overlaps or cuts texts, for arms with one, six and twelve joints; test_pages.py has seven."""
+"""Check that no page overlaps or cuts texts, for arms with one, six, seven and twelve joints."""
 
 from __future__ import annotations
 
@@ -85,6 +85,7 @@ def open_page(visitor: Visitor, name: str, route: str) -> None:
         pytest.param("crane", ("light",), marks=pytest.mark.journey),
         ("crane", ("dark",)),
         ("ur10", ("light", "dark")),
+        ("panda", ("light", "dark")),
         ("turntable", ("light", "dark")),
     ],
     ids=lambda each: each if isinstance(each, str) else "-".join(each),
