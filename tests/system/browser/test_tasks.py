@@ -133,7 +133,7 @@ def test_is_the_robot_all_right_and_what_does_it_carry(page: Page, robot: str) -
     hand = Hand(page)
     hand.click(link(page, f"Follow live: {robot}"))
     state = page.locator("main").get_by_role("status").first
-    for word in ("live", "learning up to date", "coverage"):
+    for word in ("live", "learning up to date", "usable"):
         hand.see(state.get_by_text(re.compile(rf"^\W*{word}")))
     hand.report("is the robot all right now")
     assert (hand.clicks, hand.fields) == (1, 0)

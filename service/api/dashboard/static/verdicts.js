@@ -7,9 +7,15 @@ import { Prose } from "./prose.js";
 
 const KINDS = { usable: "good", usable_in_range: "good", too_uncertain: "warn", wrong: "bad", not_judged: "plain" };
 
+/** Return the level of a verdict as text and kind of a badge. */
+export function verdictState({ level, label }) {
+  return [label, KINDS[level]];
+}
+
 /** A badge with the level of a verdict. */
-export function VerdictBadge({ verdict: { level, label, reason } }) {
-  return html`<${Badge} state=${label} kind=${KINDS[level]} title=${reason} />`;
+export function VerdictBadge({ verdict }) {
+  const [state, kind] = verdictState(verdict);
+  return html`<${Badge} state=${state} kind=${kind} title=${verdict.reason} />`;
 }
 
 /** A badge with the level of a joint. */

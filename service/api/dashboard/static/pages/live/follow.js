@@ -2,9 +2,10 @@
 
 import { get, path } from "../../api.js";
 import { Badge, Card, ErrorBox, Heading, useRead } from "../../components.js";
-import { count, counted, percent, seconds, sentence } from "../../format.js";
+import { count, counted, seconds, sentence } from "../../format.js";
 import { plotly } from "../../plots.js";
 import { html, useEffect, useRef, useState } from "../../preact.js";
+import { verdictState } from "../../verdicts.js";
 import { Alarms, Decision } from "./alarms.js";
 import { follow } from "./connection.js";
 import { NoStream } from "./no_stream.js";
@@ -16,7 +17,6 @@ import { Answers, Learning, Quality } from "./status.js";
 import { Switches } from "./switches.js";
 
 const STALE_AFTER_S = 3;
-const MIN_COVERAGE = 0.9; // as the verdict requires by default
 const MIN_LAG_S = 1; // rows wait for less in normal operation
 
 /** Follow a model until the page is left. */
@@ -90,15 +90,9 @@ function states({ status, checking, connection, rows, age, pausedAt }) {
   else if (status.failure) found.push(["learning failed", "bad"]);
   else if (status.lag_s >= MIN_LAG_S) found.push([`learning ${seconds(status.lag_s)} behind`, "busy"]);
   else if (rows?.received) found.push(["learning up to date", "good"]);
-  if (status.windows[0].rows && age <= STALE_AFTER_S) found.push(coverage(status));
+  if (status.windows[0].rows && age <= STALE_AFTER_S) found.push(verdictState(status.verdict));
   if (checking.size) found.push(["checking payload", "busy"]);
   return found;
-}
-
-/** Return the smallest coverage of the joints in the last minute as text and kind of a badge. */
-export function coverage({ windows: [latest], joint_names: names }) {
-  const known = latest.coverage.map((each) => each ?? 1), least = Math.min(...known), isLow = least < MIN_COVERAGE;
-  return [`coverage ${percent(least, 0)}${isLow ? ` on ${names[known.indexOf(least)]}` : ""}`, isLow ? "warn" : "good"];
 }
 
 function facts({ rows, age, pausedAt, lost }) {
