@@ -59,6 +59,19 @@ def dashboard(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Ite
         yield Dashboard(server, dataset, "pendulum", job)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def tidied(dashboard: Dashboard) -> Iterator[None]:
+    """Delete the models that a module has added: the overview shows only the newest."""
+
+    def names() -> set[str]:
+        return {each["name"] for each in dashboard.client.get("/v1/models", params={"limit": 100}).json()["items"]}
+
+    before = names()
+    yield
+    for name in names() - before:
+        dashboard.client.delete(f"/v1/models/{name}")
+
+
 Visit = Callable[..., Visitor]
 
 

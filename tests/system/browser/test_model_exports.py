@@ -39,14 +39,20 @@ def saved(page: Page, name: str, kind: str) -> Path:
     return download.value.path()
 
 
+def drawn(visitor: Visitor, route: str) -> Page:
+    """Open a page and wait for its plots."""
+    page = visitor.open(route)
+    expect(page.locator(".js-plotly-plot").first).to_be_visible()
+    return visitor.drawn()
+
+
 def numbers(path: Path) -> list[dict[str, str]]:
     """Return the rows of a CSV file by heading."""
     return list(csv.DictReader(path.read_text().splitlines()))
 
 
 def test_plots_of_the_accuracy_are_saved(visitor: Visitor, model: str) -> None:
-    page = visitor.open(f"#/models/{model}?part=all")
-    visitor.drawn()
+    page = drawn(visitor, f"#/models/{model}?part=all")
     for name in ("torque", "reliability", "error by segment"):
         assert saved(page, f"{name} of {model} 2", "PNG").read_bytes().startswith(PNG), name
     torque = numbers(saved(page, f"torque of {model} 2", "CSV"))
@@ -63,8 +69,7 @@ def test_plots_of_the_accuracy_are_saved(visitor: Visitor, model: str) -> None:
 
 
 def test_components_are_saved(visitor: Visitor, model: str) -> None:
-    page = visitor.open(f"#/models/{model}?part=all&tab=parts")
-    visitor.drawn()
+    page = drawn(visitor, f"#/models/{model}?part=all&tab=parts")
     assert saved(page, f"components of {model} 2", "PNG").read_bytes().startswith(PNG)
     rows = numbers(saved(page, f"components of {model} 2", "CSV"))
     assert len(rows) == 2 * SAMPLES

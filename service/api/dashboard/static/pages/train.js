@@ -116,7 +116,7 @@ function Serving({ value, onchange, models, estimator, joints }) {
         ${bases.map((each) => [`${each.name}:${each.serving_version}`, each]).map(([address, each]) => html`<option key=${address} value=${address} selected=${address === value.base}>${each.name}, version ${each.serving_version}</option>`)}
       </select>`} />
     <${Field} label="Joint types" hint=${`revolute or prismatic for each${joints ? ` of ${joints} joints` : " joint"}, separated by commas.`}
-      input=${(attributes) => html`<input ...${attributes} type="text" name="joint_types" value=${value.joint_types} onInput=${set("joint_types")} placeholder="those of the robot, or revolute" autocomplete="off" />`} />
+      input=${(attributes) => html`<input ...${attributes} type="text" name="joint_types" value=${value.joint_types} onInput=${set("joint_types")} placeholder="of the robot, or revolute" autocomplete="off" />`} />
   </fieldset>`;
 }
 

@@ -13,13 +13,13 @@ const QUANTITIES = [
   ["tau", "torque", ["N*m", "mN*m", "N*cm", "N*mm", "kgf*cm", "A", "mA"]],
   ["episode", "episode", []],
 ];
-const EFFORT = [["", "default of the robot or the file"], ...["measured", "commanded", "current"].map((each) => [each, EFFORTS[each]])];
+const EFFORT = [["", "of robot or file (default)"], ...["measured", "commanded", "current"].map((each) => [each, EFFORTS[each]])];
 const SELECTS = {
   effort: EFFORT,
   torque_convention: [["", "derived from the effort"], ["gravity_included", "gravity included"], ["gravity_compensated", "gravity compensated"]],
   poses: [["", "motion"], ["true", "held poses, one a row"]],
   delimiter: [["", "auto-detect"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]],
-  filtering: [["", "only if signals are derived (default)"], ["always", "always"], ["never", "never"]],
+  filtering: [["", "if derived (default)"], ["always", "always"], ["never", "never"]],
   form: [["", "zero-phase (default)"], ["causal", "causal, as in a live stream"]],
 };
 const NUMBERS = { dt: [0.000001, 100], cutoff: [0.01, 1000], rate: [0.01, 1000000], gap: [1.01, 1000000], trim: [0, 1000000] };

@@ -34,7 +34,7 @@ export function RobotChoice({ reading, value, onchange, none, withUrdf = false, 
   const profile = profiles.find((each) => each.name === value);
   const there = usable.some((each) => each.name === value) || uploaded.some((each) => each.id === value);
   const group = (label, options) => options.length > 0 && html`<optgroup label=${label}>${options.map(([each, text]) => html`<option key=${each} value=${each} selected=${each === value}>${text}</option>`)}</optgroup>`;
-  const select = (attributes) => html`<select ...${attributes} name="robot" disabled=${Boolean(disabled)} onChange=${(event) => onchange(event.target.value)}>
+  const select = (attributes) => html`<select ...${attributes} name="robot" title=${profile?.title} disabled=${Boolean(disabled)} onChange=${(event) => onchange(event.target.value)}>
     <option value="" selected=${!there}>${none}</option>
     ${group("Known robots", usable.map((each) => [each.name, `${each.name} – ${each.title}`]))}
     ${group("Uploaded URDFs", uploaded.map((each) => [each.id, `${each.name} (${each.id})`]))}
