@@ -1,4 +1,4 @@
-"""The verdict on a model: one level, why, and what to do. `lipcore.model.verdict` decides it."""
+"""The verdict on a model: one level, why, and what to do. `lipcore.model.judging` decides it."""
 
 from __future__ import annotations
 

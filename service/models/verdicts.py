@@ -10,8 +10,9 @@ import numpy as np
 
 from lipcore.data.coverage import clopper_pearson
 from lipcore.data.samples import Array
-from lipcore.model import verdict
-from lipcore.model.verdict import Fault, JudgedFigures, JudgedOn, OutsideFigures, VerdictOptions
+from lipcore.model import judging
+from lipcore.model.verdict import OPTIONS, Fault, JudgedFigures, JudgedOn, OutsideFigures, VerdictOptions
+from lipcore.model.verdict import Verdict as JudgedVerdict
 from lipcore.online.record import HALF_WIDTH
 from lipcore.online.window import Window
 from service.contract.datasets import Cause, Remedy
@@ -31,10 +32,10 @@ SPOILING: frozenset[Cause] = frozenset(
 
 def options_of(row: ModelRow | None) -> VerdictOptions:
     """Return the thresholds of a model; the defaults for a new one."""
-    return replace(verdict.OPTIONS, **((row and row.thresholds) or {}))
+    return replace(OPTIONS, **((row and row.thresholds) or {}))
 
 
-def of_version(manifest: Mapping[str, Any], options: VerdictOptions = verdict.OPTIONS) -> Verdict:
+def of_version(manifest: Mapping[str, Any], options: VerdictOptions = OPTIONS) -> Verdict:
     """Return the verdict on a version by its manifest: by the held-out part of its training, or by `judged`.
 
     `judged` in a lineage has the figures of other rows: of recordings for the shipped model, of streams for a refresh.
@@ -44,7 +45,7 @@ def of_version(manifest: Mapping[str, Any], options: VerdictOptions = verdict.OP
     if figures is not None:
         judged_on = "held_out" if not lineage.get("judged") else "stream" if "refresh" in lineage else "recording"
     repeats = _judged_record(lineage).get("repeats_training")
-    return represent(verdict.judge(figures, judged_on, repeats, faults_of(lineage), options=options))
+    return represent(judging.judge(figures, judged_on, repeats, faults_of(lineage), options=options))
 
 
 def figures_of_version(manifest: Mapping[str, Any]) -> JudgedFigures | None:
@@ -62,7 +63,7 @@ def of_evaluation(
     manifest: Mapping[str, Any],
     judged_on: JudgedOn,
     data: DatasetRow,
-    options: VerdictOptions = verdict.OPTIONS,
+    options: VerdictOptions = OPTIONS,
 ) -> Verdict:
     """Return the verdict on a version by an evaluation of it on a data set. record: fields of `Evaluation`."""
     known = {
@@ -75,7 +76,7 @@ def of_evaluation(
     faulty = []
     if judged_on != "training":
         faulty = [Fault(text, texts.describe_other_reading(data.id)) for text in find_faults(data)]
-    return represent(verdict.judge(figures, judged_on, record.get("repeats_training"), faults, faulty, options))
+    return represent(judging.judge(figures, judged_on, record.get("repeats_training"), faults, faulty, options))
 
 
 def of_recording(data: DatasetRow) -> Verdict:
@@ -83,7 +84,7 @@ def of_recording(data: DatasetRow) -> Verdict:
     report = data.report
     rate, excitation = report.get("rate_hz"), report.get("excitation") or {}
     standstill = excitation.get("standstill")
-    found = verdict.judge_recording(
+    found = judging.judge_recording(
         seconds=data.rows / rate if rate else None,
         moving=None if standstill is None else 1 - standstill,
         period=excitation.get("period_s"),
@@ -96,7 +97,7 @@ def of_window(
     window: Window,
     now: float,
     manifest: Mapping[str, Any],
-    options: VerdictOptions = verdict.OPTIONS,
+    options: VerdictOptions = OPTIONS,
 ) -> Verdict:
     """Return the verdict on the intervals in responses, by the rows of a window before a Unix time, s.
 
@@ -105,7 +106,7 @@ def of_window(
     record, spans, held = window.record(now), window.count_spans(now), window.held(now)
     faults = faults_of(manifest["lineage"])
     if not record.rows:
-        return represent(verdict.judge(None, "stream", faults=faults))
+        return represent(judging.judge(None, "stream", faults=faults))
     n = record.n_joints
     coverage, factor = (
         (held.inside / held.rows, held.factors / held.rows) if held.rows else (record.coverage, np.ones(n))
@@ -132,10 +133,10 @@ def of_window(
         moving=None,
         seconds=spans * window.span_s,
     )
-    return represent(verdict.judge(figures, "stream", faults=faults, options=options))
+    return represent(judging.judge(figures, "stream", faults=faults, options=options))
 
 
-def represent(found: verdict.Verdict) -> Verdict:
+def represent(found: JudgedVerdict) -> Verdict:
     """Return a verdict as the API shows it."""
     return Verdict.model_validate({**vars(found), "label": LABELS[found.level], "serves": found.serves})
 

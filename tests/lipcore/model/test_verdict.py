@@ -9,17 +9,9 @@ from lipcore.data.metrics import quantile
 from lipcore.data.motion import Motion
 from lipcore.data.signals import noise_level
 from lipcore.model import texts
+from lipcore.model.judging import judge, judge_recording
 from lipcore.model.torque_model import training_range
-from lipcore.model.verdict import (
-    LEVELS,
-    OPTIONS,
-    Fault,
-    JudgedFigures,
-    OutsideFigures,
-    is_outside,
-    judge,
-    judge_recording,
-)
+from lipcore.model.verdict import LEVELS, OPTIONS, Fault, JudgedFigures, OutsideFigures, is_outside
 
 OUTSIDE = OutsideFigures(share=0.4, squared=np.array([0.02, 1.5]), coverage=np.array([0.95, 0.93]))
 GOOD = JudgedFigures(
