@@ -311,3 +311,24 @@ def test_click_in_progress_survives_a_change_of_the_header(
     expect(page.get_by_role("button", name="Serve version 1")).to_be_visible()
     page.mouse.up()
     expect(page.get_by_role("heading", level=1, name=f"{name} live")).to_be_visible()
+
+
+@pytest.mark.parametrize(
+    ("times", "breaks", "expected"),
+    [
+        ([5, 6, 7, 8], [], [0, 1, 2, 3]),
+        ([5, 6, 8, 9], [2], [0, 1, 3, 4]),
+        ([5, 6, 1006, 1007], [2], [0, 1, 1.1, 2.1]),
+        ([5, 6, 1006, 1007, 9007], [2, 4], [0, 1, 1.1, 2.1, 2.2]),
+    ],
+)
+def test_long_pauses_are_cut(visitor: Visitor, times: list[float], breaks: list[int], expected: list[float]) -> None:
+    found = visitor.open("#/data").evaluate(
+        """async (trace) => {
+          const { axis } = await import("/dashboard/pages/model/curves.js");
+          return axis(trace, 5);
+        }""",
+        {"t": times, "breaks": breaks},
+    )
+    assert found["x"] == pytest.approx(expected)
+    assert found["isCut"] == (times[-1] > 1000)

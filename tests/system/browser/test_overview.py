@@ -253,3 +253,11 @@ def test_health_is_one_line_until_a_check_fails(visitor: Visitor, state: str) ->
     page.unroute_all(behavior="wait")
     expect(health.get_by_role("status")).to_have_text("✓ ready")
     expect(health.get_by_role("listitem").filter(visible=True)).to_have_count(0)
+
+
+def test_serving_version_is_no_candidate(visitor: Visitor, dashboard: Dashboard) -> None:
+    page = visitor.page
+    changed(page, dashboard.model, serving_version=1, candidate=1)
+    visitor.open("#/")
+    expect(card(page, dashboard.model)).to_contain_text("Version 1 serves")
+    expect(card(page, dashboard.model)).not_to_contain_text("candidate")

@@ -5,6 +5,8 @@ import { line } from "../../plots.js";
 /** Half-width of a Gaussian's 95 % interval, in standard deviations. */
 export const Z95 = 1.959963984540054;
 
+const SHOWN_PAUSE = 0.05; // length of a cut pause, as a share of the motion
+
 /** Return the standard deviation of a measurement: uncertainty of the model and noise, times the version's scale. */
 export function measurementStd(trace, joint) {
   const noise = trace.noise_std[joint], scale = trace.scale[joint];
@@ -16,10 +18,21 @@ export function column(rows, joint) {
   return rows.map((row) => row[joint]);
 }
 
-/** Return the horizontal axis of a trace: time since the origin, or row numbers if the time of an episode starts again. */
+/**
+ * Return the horizontal axis of a trace: time since the origin, or row numbers if the time of an episode starts again.
+ * Pauses that are longer than the motion are cut; `isCut` tells whether there are any.
+ */
 export function axis(trace, origin) {
-  const rising = trace.t.every((value, index) => index === 0 || value >= trace.t[index - 1]);
-  return rising ? { x: trace.t.map((each) => each - origin), suffix: " s" } : { x: trace.rows, suffix: "" };
+  const { t, breaks } = trace;
+  if (!t.every((value, index) => index === 0 || value >= t[index - 1])) return { x: trace.rows, suffix: "", isCut: false };
+  const pauses = new Map(breaks.map((at) => [at, t[at] - t[at - 1]]));
+  const motion = t.at(-1) - t[0] - [...pauses.values()].reduce((sum, each) => sum + each, 0);
+  let removed = 0;
+  const x = t.map((value, index) => {
+    if (pauses.get(index) > motion) removed += pauses.get(index) - SHOWN_PAUSE * motion;
+    return value - origin - removed;
+  });
+  return { x, suffix: " s", isCut: removed > 0 };
 }
 
 /** Return a line with gaps at the breaks of the trace. */

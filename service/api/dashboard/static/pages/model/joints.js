@@ -21,7 +21,7 @@ export function JointPlots({ first, fetch, views, about, types, name: title, num
   const { joint_names: joints } = first, names = shortNames(joints), labels = Object.keys(views);
   const [joint, setJoint] = useState(ALL), [view, setView] = useState(labels[0]), [rows, setRows] = useState(null);
   const read = useRead(async (signal) => (rows ? fetch(rows, signal) : first), [first, rows]);
-  const trace = read.value ?? first, { x, suffix } = axis(trace, timeOrigin(first.t[0]));
+  const trace = read.value ?? first, { x, suffix, isCut } = axis(trace, timeOrigin(first.t[0]));
   const linked = useMemo(() => new LinkedPlots({ stays: false }), []);
   const shown = useRef(null);
   shown.current = { trace, x, rows };
@@ -56,7 +56,7 @@ export function JointPlots({ first, fetch, views, about, types, name: title, num
       <${Choice} label="Joint" options=${[ALL, ...joints]} value=${joint} onchange=${setJoint} />
       ${labels.length > 1 && html`<${Choice} label="Show" options=${labels} value=${view} onchange=${setView} />`}
     </div>
-    <p class="hint">${about[view]} ${shownRows(trace)} ${rows && html`<${Button} onclick=${() => setRows(null)}>Show all rows<//>`}</p>
+    <p class="hint">${about[view]} ${shownRows(trace)} ${isCut && "Long pauses are cut. "}${rows && html`<${Button} onclick=${() => setRows(null)}>Show all rows<//>`}</p>
     <${Legend} traces=${views[view](trace, 0, x)} />
     ${read.error && html`<${ErrorBox} error=${read.error} />`}
     <div class="joint-plots">${joints.map(one)}</div>

@@ -21,9 +21,14 @@ export function Models({ shown: { items, next_cursor: cursor, live_after_s: live
 }
 
 function rank(model, live) {
-  const reasons = [model.held, model.failure, model.serving_version !== null && model.verdict.level === "wrong", isLive(model, live), model.candidate];
+  const reasons = [model.held, model.failure, model.serving_version !== null && model.verdict.level === "wrong", isLive(model, live), waits(model)];
   const first = reasons.findIndex(Boolean);
   return first < 0 ? reasons.length : first;
+}
+
+/** Return whether a version waits for approval. */
+function waits({ candidate, serving_version: serving }) {
+  return candidate !== null && candidate !== serving;
 }
 
 function isLive({ idle_s: idle }, live) {
@@ -60,7 +65,7 @@ function State({ model, isLive: streams }) {
 function Serving({ model: { serving_version: version, latest_version: latest, verdict } }) {
   const what = version === null ? `No version serves. Version ${latest} is a candidate` : `Version ${version} serves`;
   return html`<p>${what}: <${VerdictBadge} verdict=${verdict} /></p>
-    <p class="hint">${verdict.reason}</p>`;
+    <p class="hint clamped" title=${verdict.reason}>${verdict.reason}</p>`;
 }
 
 /** The learnt arm; joints in a row if none was learnt. */
@@ -92,6 +97,6 @@ function News({ model, address }) {
   return html`
     ${held && html`<p class="robot-news">The robot may have changed. Learning is paused until you decide. <${Link} to=${`#/live/${address}`} label=${`Decide: ${model.name}`}>Decide<//></p>`}
     ${failure && html`<p class="robot-news">Learning failed: ${sentence(failure)}</p>`}
-    ${candidate && html`<p class="robot-news">${version === null ? "It waits for your approval." : `Version ${candidate} is a candidate.`} <${Link} to=${`#/models/${address}?tab=versions`} label=${`Review version ${candidate} of ${model.name}`}>Review<//></p>`}
-    ${isNew && html`<p class="robot-news"><${Badge} state=${PLAIN_NEWS.has(alarm.kind) ? alarm.kind : "warning"} kind=${PLAIN_NEWS.has(alarm.kind) ? "plain" : "warn"} /> ${sentence(alarm.message)} <span class="muted">${ago(alarm.at)}</span></p>`}`;
+    ${waits(model) && html`<p class="robot-news">${version === null ? "It waits for your approval." : `Version ${candidate} is a candidate.`} <${Link} to=${`#/models/${address}?tab=versions`} label=${`Review version ${candidate} of ${model.name}`}>Review<//></p>`}
+    ${isNew && html`<p class="robot-news clamped" title=${alarm.message}><${Badge} state=${PLAIN_NEWS.has(alarm.kind) ? alarm.kind : "warning"} kind=${PLAIN_NEWS.has(alarm.kind) ? "plain" : "warn"} /> ${sentence(alarm.message)} <span class="muted">${ago(alarm.at)}</span></p>`}`;
 }
