@@ -79,7 +79,7 @@ def test_components_are_saved(visitor: Visitor, model: str) -> None:
 def test_comparison_is_saved(visitor: Visitor, model: str) -> None:
     page = visitor.open(f"#/models/{model}?tab=versions")
     page.get_by_role("button", name="Compare", exact=True).click()
-    expect(page.locator(".joint-plots")).to_be_visible()
+    expect(page.locator(".joint-plots .js-plotly-plot").first).to_be_visible()
     visitor.drawn()
     name = f"versions 2, 1 of {model}"
     assert saved(page, name, "PNG").read_bytes().startswith(PNG)
