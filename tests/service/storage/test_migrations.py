@@ -92,6 +92,7 @@ def test_database_of_an_older_release_is_rejected_unchanged(home_of_0_2_0, chang
     assert dump(home_of_0_2_0) == before
 
 
+@pytest.mark.own_files("it reads the home's SQLite file")
 def test_stream_reports_and_events_become_records(tmp_path):
     body = {"mass": 2.0, "com": [0.0, 0.0, 0.1], "inertia": None}
     gate = ContactGate.start(0.5).let_all_pass().to_json()
