@@ -164,8 +164,8 @@ class MisfitMonitor:
 
     def report_pause(self, stream: StreamClient) -> None:
         """Report that learning is paused because of the stream's first second, or confirm it with --yes-learn."""
-        if self._checks_left:
-            self._checks_left -= not self._report_own_misfit()
+        if self._checks_left and not self._report_own_misfit():
+            self._checks_left -= 1
         if self._reported or not stream.learnt.rejected.get("change"):
             return
         held = self._client.learning(self._model).status.held
