@@ -40,7 +40,7 @@ ESTIMATOR_CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", *ROBOT_ESTIMA
 """Values of `estimator` in a request: `auto`, and the estimators of `lipcore.estimators.catalogue`."""
 
 ENERGY_ESTIMATORS = ("lip", "lip-chain", *ROBOT_ESTIMATORS)
-"""Estimators whose torque follows from energies. They offer all COMPONENTS, the others only friction."""
+"""Estimators whose torque follows from energies."""
 
 TORCH_ESTIMATORS = ("se", "gip", "lse")
 """Estimators that torch differentiates in training, on a GPU if there is one. They need the extra `train`; their
@@ -94,3 +94,8 @@ class Code(IntEnum):
 
 CODES = tuple(code.name.lower() for code in Code)
 """Names of the codes, in the order of their numbers."""
+
+
+def offered_components(estimator: str) -> tuple[ComponentName, ...]:
+    """Return the components of an estimator: all if its torque follows from energies, else friction only."""
+    return COMPONENTS if estimator in ENERGY_ESTIMATORS else ("friction",)

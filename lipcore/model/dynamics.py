@@ -25,7 +25,7 @@ from lipcore.model.functionals import (
 )
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.exact import Posterior
-from lipcore.vocabulary import COMPONENTS, ComponentName
+from lipcore.vocabulary import COMPONENTS, ComponentName, offered_components
 
 _TORQUES: dict[ComponentName, dict[str, float]] = {
     "gravity": {"rest": 1.0},
@@ -50,12 +50,6 @@ class IndefiniteInertiaError(ValueError):
             "training data"
         )
         self.index = index
-
-
-def available_components(estimator: Estimator) -> tuple[ComponentName, ...]:
-    """Return the components of an estimator: all if its torque is derived from energies, else friction only."""
-    terms = _dynamics_terms(estimator)
-    return COMPONENTS if terms and len(_energy_terms(estimator)) == len(terms) else ("friction",)
 
 
 def components(
@@ -223,7 +217,7 @@ def _energy_terms(estimator: Estimator) -> list[EnergyKernel]:
 
 
 def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Array | None) -> list[ComponentName]:
-    offered = available_components(model.estimator)
+    offered = offered_components(model.estimator.name)
     for name in names:
         if name not in offered:
             raise UnavailableComponentError(

@@ -71,7 +71,6 @@ def judge_recording(
     moving: float | None,
     period: float | None,
     faults: Sequence[Fault] = (),
-    options: VerdictOptions = OPTIONS,
 ) -> Verdict:
     """Return the best verdict that a model of a recording can get, by its held-out part alone.
 
@@ -80,19 +79,18 @@ def judge_recording(
         moving: Share of its samples in which a joint moves; None if unknown.
         period: Time after which its motion repeats itself, s; None if it does not.
         faults: Its faults, the gravest first.
-        options: Thresholds.
 
     Example:
         >>> judge_recording(6.0, 1.0, None).reason
         'Only 1.8 s can be judged, at least 3 s are needed.'
 
     """
-    short = _why_too_short(None if seconds is None else Split().share * seconds, options)
+    short = _why_too_short(None if seconds is None else Split().share * seconds, OPTIONS)
     if faults:
         return Verdict("wrong", faults[0].text, faults[0].action, "nothing")
     if short is not None:
         return Verdict("not_judged", short, texts.RECORD_LONGER, "nothing")
-    if _is_at_rest(moving, options):
+    if _is_at_rest(moving, OPTIONS):
         return Verdict("usable_in_range", texts.JUDGED_AT_REST, texts.RECORD_OTHER_MOTION, "nothing")
     if period is not None:
         return Verdict("usable_in_range", texts.describe_periodic(period), texts.RECORD_OTHER_MOTION, "nothing")

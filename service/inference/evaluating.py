@@ -16,6 +16,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
 from lipcore.model.verdict import JudgedOn
 from lipcore.profiles import profile, recognise
+from lipcore.vocabulary import offered_components
 from service.contract import predictions as schema
 from service.contract.holdout import Evaluation, HoldoutLineage
 from service.contract.verdict import Verdict
@@ -222,7 +223,7 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
     if request.points > MAX_TRACE_POINTS:
         raise invalid_request("points", request.points, f"at most {MAX_TRACE_POINTS}")
     served = loaded.get(model, request.version, request.alias)
-    offered = dynamics.available_components(served.model.estimator)
+    offered = offered_components(served.model.estimator.name)
     check_offered(served.model, request.components)
     dataset = find_dataset(loaded, request.dataset, served)
     path = loaded.files.samples_file(dataset.id, dataset.sha256)

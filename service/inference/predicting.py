@@ -16,7 +16,7 @@ from lipcore.model import dynamics
 from lipcore.model.functionals import Estimate
 from lipcore.model.payload import NoArmError
 from lipcore.model.torque_model import TorqueModel
-from lipcore.vocabulary import ROBOT_ESTIMATORS, ComponentName
+from lipcore.vocabulary import ROBOT_ESTIMATORS, ComponentName, offered_components
 from service.contract.decoding import HotDecoder, struct_of
 from service.contract.payload import Payload
 from service.contract.predictions import History, PredictRequest, PredictResponse
@@ -121,7 +121,7 @@ def check_answer(name: str, values: Array) -> None:
 
 def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> None:
     """Raise InvalidRequestError for a component that the model's estimator does not offer."""
-    offered = dynamics.available_components(model.estimator)
+    offered = offered_components(model.estimator.name)
     for index, name in enumerate(components):
         if name not in offered:
             expected = f"a component of estimator {model.estimator.name}: {', '.join(offered)}"

@@ -14,7 +14,7 @@ import lipcore
 from lipcore.estimators.base import RobotKind
 from lipcore.files.persistence import checksums, read_manifest
 from lipcore.model.verdict import OPTIONS, VerdictOptions
-from lipcore.vocabulary import COMPONENTS, ENERGY_ESTIMATORS
+from lipcore.vocabulary import offered_components
 from service.contract.models import Model, ModelPage, Promotion, Version, VersionSummary
 from service.contract.verdict import Thresholds
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
@@ -317,7 +317,7 @@ def show_version(database: Database, model: str, version: int) -> Version:
     options = verdict_options(database, [model]).get(model, OPTIONS)
     return Version(
         **about,
-        components=COMPONENTS if row.manifest["estimator"] in ENERGY_ESTIMATORS else ["friction"],
+        components=list(offered_components(row.manifest["estimator"])),
         verdict=verdicts.of_version(row.manifest, options),
         **fields,
     )

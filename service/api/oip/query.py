@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.model.dynamics import available_components
 from lipcore.model.external import external
 from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePrediction
-from lipcore.vocabulary import COMPONENTS, ComponentName
+from lipcore.vocabulary import COMPONENTS, ComponentName, offered_components
 from service.api.oip import schema
 from service.api.oip.sequences import Sequences, read_part
 from service.api.oip.tensors import Answer, Header, Message
@@ -60,7 +59,7 @@ OUTPUTS_NEEDING_TORQUE |= EXTERNAL_OUTPUTS.keys()
 
 def shapes(model: TorqueModel) -> dict[str, Shape]:
     """Return the shape of every output of a model for N queries; -1 stands for N."""
-    n, offered = model.n_joints, available_components(model.estimator)
+    n, offered = model.n_joints, offered_components(model.estimator.name)
     tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n), FALLBACK: (-1, n)}
     tensors |= dict.fromkeys(sorted(MODEL_OUTPUTS), (n,))
     tensors |= {name: (-1, 1) if name in ARM_OUTPUTS else (-1, n) for name in EXTERNAL_OUTPUTS}
@@ -129,7 +128,7 @@ def _outputs(request: schema.InferRequest, model: TorqueModel) -> dict[str, bool
         if name in outputs:
             raise invalid_request(f"{field}.name", name, "each output once", f"Output `{name}` is requested twice.")
         part = COMPONENT_TENSORS.get(name)
-        if (part is None or part.component not in available_components(model.estimator)) and name not in (
+        if (part is None or part.component not in offered_components(model.estimator.name)) and name not in (
             *INLINE_OUTPUTS,
             "covariance",
         ):

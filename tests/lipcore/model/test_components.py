@@ -16,6 +16,7 @@ from lipcore.estimators.catalogue import make_estimator
 from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.model import dynamics
+from lipcore.model.functionals import EnergyKernel
 from lipcore.model.torque_model import training_range
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
@@ -23,6 +24,7 @@ from lipcore.posterior.statistics import collect
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
+from lipcore.vocabulary import COMPONENTS, offered_components
 from tests.choosing import few
 from tests.lipcore.oracles import (
     Energy,
@@ -365,3 +367,10 @@ def test_components_follow_the_deflections_of_a_motion() -> None:
     np.testing.assert_allclose(sum(each.mean for each in parts.values()), tau, rtol=1e-6, atol=1e-9)
     found = dynamics.components(model, motion, ["forward_dynamics"], tau)["forward_dynamics"].mean
     np.testing.assert_allclose(found, motion.ddq, atol=1e-6 * np.abs(motion.ddq).max())
+
+
+@pytest.mark.parametrize("name", ["lip", "lip-chain", "se", "gip", "lse"])
+def test_all_components_are_offered_if_the_torque_follows_from_energies(name):
+    terms = [term for part, term in make_estimator(name, ("revolute",) * 2).terms.items() if part != "friction"]
+    follows = all(isinstance(term, EnergyKernel) for term in terms)
+    assert offered_components(name) == (COMPONENTS if follows else ("friction",))

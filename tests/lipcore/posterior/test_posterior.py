@@ -20,6 +20,7 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.compression import Deviation, compress
 from lipcore.posterior.exact import ExactPosterior, negative_log_evidence
 from lipcore.posterior.statistics import collect
+from lipcore.vocabulary import offered_components
 from tests import ROOT
 from tests.lipcore.estimators.test_estimators import train_estimator
 from tests.lipcore.online.test_learner import simulate_pendulum
@@ -195,7 +196,7 @@ def test_all_outputs_give_the_exact_posterior(case: Case) -> None:
 
 
 def test_components_match_the_exact_posterior(case: Case) -> None:
-    names = [name for name in dynamics.available_components(case.model.estimator) if name != "forward_dynamics"]
+    names = [name for name in offered_components(case.model.estimator.name) if name != "forward_dynamics"]
     expected = dynamics.components(replace(case.model, posterior=case.exact), case.unseen[:20], names)
     answer = dynamics.components(case.model, case.unseen[:20], names)
     for name in names:

@@ -216,9 +216,9 @@ def test_latency_is_measured_over_stream_and_http(lipserve, streaming):
 def test_consecutive_refusals_for_one_reason_are_merged():
     off, full = ("conflict", "frame {} was sent before"), ("storage_full", "the disk is full")
     given = [(1, 11, off), (12, 20, off), (21, 22, full), (30, 31, full), (32, 40, off)]
-    told = refused_figures(
+    refused = refused_figures(
         [StreamRefusal(first, through, code, text.format(first), []) for first, through, (code, text) in given]
     )
     merged = [(1, 20, off[0]), (21, 22, full[0]), (30, 31, full[0]), (32, 40, off[0])]
-    assert [(each["first"], each["through"], each["code"]) for each in told] == merged
-    assert told[0]["message"] == "frame 1 was sent before"
+    assert [(each["first"], each["through"], each["code"]) for each in refused] == merged
+    assert refused[0]["message"] == "frame 1 was sent before"

@@ -29,8 +29,8 @@ def test_verdict_is_the_same_in_api_and_command_line(asking, lipserve, name):
     assert (verdict["level"], case.words in verdict["reason"]) == (case.level, True), verdict["reason"]
     assert jobs[name]["verdict"] == verdict
     code, text, err = lipserve("models", "show", f"{model}@{number}", "--url", server.url)
-    told = " ".join(text.split())
-    assert (code, f"{verdict['label']}: {in_shell(verdict['reason'])}" in told) == (0, True), f"{told} {err}"
+    printed = " ".join(text.split())
+    assert (code, f"{verdict['label']}: {in_shell(verdict['reason'])}" in printed) == (0, True), f"{printed} {err}"
     assert shown["promotion"]["answers"] == case.serves
     assert verdict["reason"] in shown["promotion"]["reason"]
 

@@ -1,4 +1,4 @@
-// Says what is missing if the modules of the dashboard cannot be loaded, instead of an empty page.
+// Shows an error instead of an empty page if a module of the dashboard cannot be loaded.
 
 addEventListener("error", ({ target }) => {
   if (!(target instanceof HTMLScriptElement) || target.type !== "module") return;
