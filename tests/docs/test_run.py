@@ -76,5 +76,5 @@ def test_quick_blocks_of_page_run(runner, page):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", SLOW_PAGES, ids=page_id)
 def test_all_blocks_of_page_run(tmp_path, page):
-    with Server(tmp_path / "home", warm=True) as server:
+    with Server(tmp_path / "home") as server:
         run_blocks(BlockRunner(tmp_path, server), page, slow=True)
