@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS, Arm
-from lipcore.kernels.base import LinearKernel, Params, Regressor
+from lipcore.kernels.base import LinearKernel, Params, Regressor, State, constant, on_diagonal, reordered
 from lipcore.kernels.fast.arm import (
     arm_energies,
     arm_queries,
@@ -23,6 +23,7 @@ from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.fast.views import Memory
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.mixture import MixtureKernel
+from lipcore.kernels.newton_euler import linearised_torque, rigid_body_features
 
 SCALES = 4
 """Number of kinds of weights with their own scale: masses, first moments, inertias, rotors."""
@@ -82,6 +83,28 @@ class ArmKernel(LinearKernel):
         out = np.zeros((len(motion), n))
         arm_torques(geometry.constants, geometry.gravity, bodies, self.arm.order, motion.arrays(), out)
         return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq)
+
+    def formula(self, x: Motion) -> Array:
+        """Return Φᵀ of N queries, (p, n, N), see `LinearKernel.formula`."""
+        arm, n = self.arm, self.n_joints
+        masses, steps = rigid_body_features(arm.geometry, arm.parameters, State.paired(x).ordered(arm.order))
+        masses = reordered(masses.reshape(n, PARAMETERS, n, -1), arm.place).reshape(PARAMETERS * n, n, -1)
+        xp = array_namespace(masses)
+        rows = [reordered(masses, arm.place, 1), on_diagonal(x.ddq.T)]
+        if arm.steps:
+            rows.append(reordered(steps, arm.place, 1))
+        if self.others is not None:
+            rows.append(self.others.formula(x))
+        return xp.concat(rows)
+
+    def weighted(self, weights: Array, x: Motion) -> Array:
+        """Return Φ w of N queries, (n, N), without the features; see `LinearKernel.weighted`."""
+        arm, n = self.arm, self.n_joints
+        bodies, rotor, rest = np.split(weights, [PARAMETERS * n, self.steps.start])
+        bodies, state = bodies.reshape(n, PARAMETERS)[arm.order], State.paired(x).ordered(arm.order)
+        torque = linearised_torque(arm.geometry, bodies, state, arm.parameters, rest[: arm.steps])
+        torque = reordered(torque, arm.place) + (constant(rotor, x.ddq) * x.ddq).T
+        return torque if self.others is None else torque + self.others.weighted(rest[arm.steps :], x)
 
     def features(self, x: Motion) -> Array:
         """Return Φ at each sample, (N, n, p)."""

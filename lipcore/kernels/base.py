@@ -7,10 +7,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import array_namespace, device, is_torch_namespace
 from numpy.typing import NDArray
 
-from lipcore.data.motion import Array, Motion
+from lipcore.data.motion import Array, Indices, Motion
 from lipcore.extras import import_extra
 
 Params = Mapping[str, Array]
@@ -101,6 +101,10 @@ class State:
     def paired(cls, motion: Motion) -> State:
         """Return either argument if sample k is paired with sample k alone, (n, N)."""
         return cls(motion.q.T, motion.dq.T, motion.ddq.T)
+
+    def ordered(self, joints: Indices) -> State:
+        """Return the joints in another order. joints: (n,), their places in this one."""
+        return State(*(reordered(each, joints) for each in (self.q, self.v, self.a)))
 
     def first(self, joints: int) -> State:
         """Return the first `joints` joints: the chain up to a link."""
@@ -237,6 +241,18 @@ class LinearKernel(TorqueKernel):
     def regressor(self) -> Regressor:
         """Return the regressor that computes Φ for single queries."""
 
+    @abstractmethod
+    def formula(self, x: Motion) -> Array:
+        """Return Φᵀ of N queries, (p, n, N), in the array API: what `features` computes, compiled.
+
+        The arrays of x are of any library.
+        """
+
+    def weighted(self, weights: Array, x: Motion) -> Array:
+        """Return Φ w of N queries, (n, N), in the array API. weights: w, (p,)."""
+        rows = self.formula(x)
+        return array_namespace(rows).tensordot(constant(weights, rows), rows, axes=1)
+
     def features(self, x: Motion) -> Array:
         """Return Φ at each sample, (N, n, p)."""
         return self.regressor().features(x.arrays())
@@ -302,6 +318,12 @@ class PartialKernel(LinearKernel):
     def regressor(self) -> Regressor:
         """Return the regressor of all weights."""
         return self._whole.regressor()
+
+    def formula(self, x: Motion) -> Array:
+        """Return Φᵀ, (p, n, N), zero for the other weights."""
+        rows = self._whole.formula(x)
+        kept: Array = constant(self._mask.astype(np.float64)[:, None, None], rows)
+        return rows * kept
 
     def features(self, x: Motion) -> Array:
         """Return Φ at each sample, (N, n, p), zero for the other weights."""
@@ -371,6 +393,26 @@ def _total(parts: list[Array]) -> Array:
     for part in parts[1:]:
         total = total + part
     return total
+
+
+def constant(values: Array, like: Array) -> Array:
+    """Return numbers as an array of the same library, type and device as `like`."""
+    xp = array_namespace(like)
+    made = xp.asarray(values, dtype=like.dtype)
+    return made.to(like.device) if is_torch_namespace(xp) else made
+
+
+def of_all_joints(blocks: Array, n: int) -> Array:
+    """Return blocks of the first joints with zeros for the others: (link, link, *batch) to (n, n, *batch)."""
+    xp, more = array_namespace(blocks), n - blocks.shape[0]
+    blocks = xp.concat([blocks, *([xp.zeros_like(blocks[:1])] * more)])
+    return xp.concat([blocks, *([xp.zeros_like(blocks[:, :1])] * more)], axis=1)
+
+
+def reordered(values: Array, rows: Indices, axis: int = 0) -> Array:
+    """Return the rows of an array of any library in another order."""
+    xp = array_namespace(values)
+    return xp.concat([values[(*[slice(None)] * axis, slice(row, row + 1))] for row in rows.tolist()], axis=axis)
 
 
 def on_diagonal(values: Array) -> Array:

@@ -21,7 +21,7 @@ from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion, check_joint_types
-from lipcore.kernels.base import Params, State, on_diagonal
+from lipcore.kernels.base import Params, State, of_all_joints, on_diagonal
 from lipcore.kernels.energy import (
     PRIOR_STD,
     initial_weights,
@@ -62,10 +62,9 @@ class ChainKernel(CompiledKernel):
     def blocks(self, params: Params, x: State, y: State) -> Array:
         """Return the covariance of torque i at x with torque j at y, (n, n, *batch) (N·m)²."""
         links = self._links(params, x, y)
-        total = array_namespace(x.q).zeros_like(links[-1][0].mixed)
-        for link, (potential, kinetic) in enumerate(links, 1):
-            total[:link, :link] += potential_blocks(potential) + kinetic.blocks()
-        return total
+        blocks = (potential_blocks(potential) + kinetic.blocks() for potential, kinetic in links)
+        first, *others = (of_all_joints(each, self.n_joints) for each in blocks)
+        return sum(others, first)
 
     def hyper(self, params: Params) -> Hyper:
         """Return the base kernels' shares (1, n, 3), the potentials' scales (n,) and the velocity weights (n, n)."""

@@ -114,11 +114,16 @@ class Geometry:
 
     def moved(self, step: Array) -> Geometry:
         """Return the geometry after a step, (g,) rad and m."""
-        numbers = np.zeros((self.n_joints, 1, 4))
-        numbers[:, 0][self._counted] = step
+        numbers = self.numbers(step)[:, None]
         turn, shift = (numbers[..., part] @ self.across for part in (slice(0, 2), slice(2, 4)))
         translation = self.translation + (self.rotation @ shift.mT)[..., 0]
         return replace(self, rotation=self.rotation @ rotation_of(turn[:, 0]), translation=translation)
+
+    def numbers(self, step: Array) -> Array:
+        """Return a step as four numbers of each joint, (n, 4); zero for those that do not exist."""
+        numbers = np.zeros((self.n_joints, 4))
+        numbers[self._counted] = step
+        return numbers
 
     @cached_property
     def turn_parts(self) -> Array:

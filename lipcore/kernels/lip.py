@@ -8,7 +8,7 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array, Motion, check_joint_types
-from lipcore.kernels.base import Params, State
+from lipcore.kernels.base import Params, State, of_all_joints
 from lipcore.kernels.energy import (
     PRIOR_STD,
     initial_weights,
@@ -58,7 +58,8 @@ class LipKernel(CompiledKernel):
                 x.first(link),
                 y.first(link),
             )
-            total[:link, :link] += kinetic  # a link's kinetic energy loads only the joints before it
+            # a link's kinetic energy loads only the joints before it
+            total = total + of_all_joints(kinetic, self.n_joints)
         return total
 
     def hyper(self, params: Params) -> Hyper:

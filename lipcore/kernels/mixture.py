@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from array_api_compat import array_namespace
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative, Arm
-from lipcore.kernels.base import LinearKernel, Params, Regressor
+from lipcore.kernels.base import LinearKernel, Params, Regressor, State, constant, reordered
 from lipcore.kernels.fast.arm import arm_differences
+from lipcore.kernels.newton_euler import rigid_body_torque
 
 
 class MixtureKernel(LinearKernel):
@@ -27,7 +30,7 @@ class MixtureKernel(LinearKernel):
 
     def __init__(self, arm: Arm, arms: Sequence[Alternative], variance: float = 1.0) -> None:
         self.n_joints, self.size, self._variance = arm.n_joints, len(arms) - 1, variance
-        self._arm = arm
+        self._arm, self._each = arm, tuple(arms)
         shares = np.array([each.probability for each in arms[1:]])
         self.mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
         self._mean = np.linalg.solve(self.mixing, shares)
@@ -38,6 +41,19 @@ class MixtureKernel(LinearKernel):
             np.stack([each.parameters for each in arms]),
             np.stack([np.concatenate([each.rotor[:, None], each.friction], axis=1) for each in arms]),
         )
+
+    def formula(self, x: Motion) -> Array:
+        """Return Φᵀ of N queries, (K, n, N), see `LinearKernel.formula`."""
+        arm, xp = self._arm, array_namespace(x.q)
+        drive = xp.concat([x.ddq[None], arm.friction.formula(x)])  # (1 + f, N, n)
+        torques = []
+        for each in self._each:
+            geometry = replace(each.geometry, gravity=self._each[0].geometry.gravity)
+            bodies = rigid_body_torque(geometry, each.parameters, State.paired(x).ordered(arm.order))
+            own = np.concatenate([each.rotor[:, None], each.friction], axis=1).T
+            torques.append(reordered(bodies, arm.place) + (drive * constant(own[:, None], drive)).sum(0).T)
+        differences = xp.stack([each - torques[0] for each in torques[1:]])
+        return xp.tensordot(constant(self.mixing.T, differences), differences, axes=1)
 
     def regressor(self) -> Regressor:
         """Return the regressor that computes Φ for single queries."""

@@ -7,11 +7,12 @@ import numpy as np
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Arm
-from lipcore.kernels.base import LinearKernel, Params, Regressor
+from lipcore.kernels.base import LinearKernel, Params, Regressor, State, reordered
 from lipcore.kernels.fast.arm import arm_energies
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.fast.payload import payload_queries, payload_query, payload_size
 from lipcore.kernels.fast.views import Memory
+from lipcore.kernels.newton_euler import rigid_body_features
 
 
 class PayloadKernel(LinearKernel):
@@ -28,16 +29,21 @@ class PayloadKernel(LinearKernel):
     def __init__(self, arm: Arm, room: Array) -> None:
         self.n_joints, self._room = arm.n_joints, np.array(room)
         self.order, self.gravity = arm.order.astype(np.int64), arm.geometry.gravity
-        self.constants = arm.geometry.constants
+        self.constants, self._geometry = arm.geometry.constants, arm.geometry
+        self._none = np.zeros((arm.n_joints, PARAMETERS))
         first = PARAMETERS * int(arm.order[-1])
         self._last = slice(first, first + PARAMETERS)
 
     def energy_features(self, x: Motion) -> Array:
         """Return the kinetic and the potential energy per unit of each weight, (N, 2, 10) J."""
-        none = np.zeros((self.n_joints, PARAMETERS))
         out = np.empty((len(x), 2, (PARAMETERS + 1) * self.n_joints))
-        arm_energies(self.constants, self.gravity, none, self.order, x.arrays(), out)
+        arm_energies(self.constants, self.gravity, self._none, self.order, x.arrays(), out)
         return np.ascontiguousarray(out[..., self._last])
+
+    def formula(self, x: Motion) -> Array:
+        """Return Φᵀ of N queries, (10, n, N), see `LinearKernel.formula`."""
+        masses, _ = rigid_body_features(self._geometry, self._none, State.paired(x).ordered(self.order))
+        return reordered(masses[-PARAMETERS:], np.argsort(self.order), 1)
 
     def regressor(self) -> Regressor:
         """Return the regressor that computes the same features for single queries."""

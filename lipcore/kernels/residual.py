@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion
-from lipcore.kernels.base import LinearKernel, Params, Regressor, on_last_diagonal
+from lipcore.kernels.base import LinearKernel, Params, Regressor, constant, on_last_diagonal
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import pack
 from lipcore.kernels.fast.lanes import LANES
@@ -49,6 +50,13 @@ class JointResidual:
     def none(cls, n: int) -> JointResidual:
         """Return a residual of zero, for one of n joints."""
         return cls(np.ones(4 * n), np.zeros((0, 4 * n)), np.zeros(0), np.zeros((0, 0)), 0.0, 0.0, np.zeros(0), 0.0)
+
+    def near(self, inputs: Array) -> Array:
+        """Return r_c(x) at N instants, (m, N). inputs: `residual_inputs`, of any library."""
+        xp = array_namespace(inputs)
+        x, z = (inputs / constant(self.lengthscales, inputs)).T, constant(self.centres.astype(np.float64), inputs)
+        distances = sum((x[d] - z[:, d : d + 1]) ** 2 for d in range(len(x)))
+        return xp.exp(-0.5 * distances)
 
     @property
     def fast(self) -> JointResidual:
@@ -112,6 +120,30 @@ class ResidualKernel(LinearKernel):
         """Write what `residual_torque` computes of N queries. motions: (N, …, n), as of `Motion.arrays`."""
         residual_torque(*self._arrays, motions, features, first, mean, beyond)
 
+    def formula(self, x: Motion) -> Array:
+        """Return Φᵀ of N queries, (p, n, N), see `LinearKernel.formula`."""
+        return self.formulas(x)[0]
+
+    def formulas(self, x: Motion) -> tuple[Array, Array, Array]:
+        """Return what `fill_all` writes, in the array API: Φᵀ (p, n, N), the mean and the variance beyond, (n, N)."""
+        inputs = residual_inputs(x)
+        xp, parts, means, left = array_namespace(inputs), [], [], []
+        for joint, each in enumerate(self.joints):
+            near = each.near(inputs)  # (m, N)
+            mean = beyond = xp.zeros_like(inputs[:, 0])
+            learnt = xp.zeros((0, *mean.shape), dtype=mean.dtype)
+            if len(each.centres):
+                mean = xp.tensordot(constant(each.weights, near), near, axes=1)
+                learnt = xp.tensordot(constant(each.root, near), near[: len(each.root)], axes=1)
+                nearest = xp.max(near, axis=0)
+                open_ = xp.clip(each.variance - (learnt * learnt).sum(0), 0.0, None)
+                beyond = open_ * (1.0 - each.taken * nearest * nearest)
+            means.append(mean)
+            left.append(beyond)
+            others = xp.zeros_like(learnt)
+            parts.append(xp.stack([learnt if k == joint else others for k in range(self.n_joints)], axis=1))
+        return xp.concat(parts), xp.stack(means), xp.stack(left)
+
     def regressor(self) -> Regressor:
         """Return the regressor of all features."""
         return _ResidualRegressor(self)
@@ -166,5 +198,6 @@ class _ResidualRegressor(Regressor):
 
 
 def residual_inputs(motion: Motion) -> Array:
-    """Return x = (q, dq, ddq, tanh(dq / SIGN_WIDTH)) of N instants, (N, 4 n)."""
-    return np.concatenate([motion.q, motion.dq, motion.ddq, np.tanh(motion.dq / SIGN_WIDTH)], axis=1)
+    """Return x = (q, dq, ddq, tanh(dq / SIGN_WIDTH)) of N instants, (N, 4 n), in the array API."""
+    xp = array_namespace(motion.q)
+    return xp.concat([motion.q, motion.dq, motion.ddq, xp.tanh(motion.dq / SIGN_WIDTH)], axis=1)

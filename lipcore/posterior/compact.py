@@ -166,6 +166,26 @@ class CompactPosterior(Posterior):
         return Prediction(prediction.mean, prediction.covariance + on_last_diagonal(more))
 
     @cached_property
+    def slopes(self) -> Array:
+        """Factors in the mean, (M,), of the torques' covariances and of the linear terms' features Φᵀ."""
+        slopes = self.weights * self._variances
+        for each in self.basis.linear:
+            if (centre := each.prior_weights()) is not None:
+                slopes[self.basis.rows(each)] += centre
+        return slopes
+
+    @cached_property
+    def feature_root(self) -> Array:
+        """Q for the linear terms' features Φᵀ instead of their covariances Λ Φᵀ, (M, M)."""
+        return self.root * self._variances
+
+    @property
+    def _variances(self) -> Array:
+        """Prior variances of the linear weights, one for the torques, (M,)."""
+        own = [each.variances(self.params) for each in self.basis.linear]
+        return np.concatenate([np.ones(len(self.basis.outputs)), *own])
+
+    @cached_property
     def covariance(self) -> Array:
         """Σ of the whitened variables, (M, M)."""
         return Solution(self.weights, self.root @ self.basis.root, len(self.basis.outputs)).covariance

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.independence import INDEPENDENT_HZ, recording_weights
@@ -13,6 +14,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.repetition import measure_distinct_share
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
+from lipcore.kernels.base import constant
 from lipcore.kernels.drive.play import deflections_of
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
@@ -123,20 +125,25 @@ class Misfit:
 
     def at_rest(self, motion: Motion) -> Array:
         """Return the variance of friction at low speed, or after unknown motion, (N, n) (N·m)²."""
-        out = self.rest * np.exp(-((motion.dq / self.slow) ** 2))
-        out = out + self.still * np.exp(-((motion.dq / SIGN_WIDTH) ** 2))
+        rest, slow, still = (constant(each, motion.dq) for each in (self.rest, self.slow, self.still))
+        exp = array_namespace(motion.dq).exp
+        out: Array = rest * exp(-((motion.dq / slow) ** 2)) + still * exp(-((motion.dq / SIGN_WIDTH) ** 2))
         if self.elements.size:
             torque, widths = self.elements
             known = deflections_of(motion, widths, self.acceleration)
-            out = out + np.square((torque * known[:, len(widths) :]).sum(axis=1))
-        return np.asarray(out)
+            out = out + (constant(torque, motion.dq) * known[:, len(widths) :]).sum(1) ** 2
+        return out
 
     def variance(self, motion: Motion) -> Array:
         """Return the variance of the torques at N instants, (N, n) (N·m)²."""
-        speed = ((motion.dq / self.speed) ** 2).mean(axis=-1, keepdims=True) - 1
-        acceleration = ((motion.ddq / self.acceleration) ** 2).mean(axis=-1, keepdims=True) - 1
-        faster = speed.clip(0.0) + ACCELERATED * acceleration.clip(0.0)
-        return np.asarray(self.at_rest(motion) + self.lasting * faster)
+        usual, lasting = (self.speed, self.acceleration), constant(self.lasting, motion.dq)
+        xp = array_namespace(motion.dq)
+        speed, acceleration = (
+            xp.clip(((each / constant(most, each)) ** 2).mean(-1) - 1, 0.0, None)[:, None]
+            for each, most in zip((motion.dq, motion.ddq), usual, strict=True)
+        )
+        total: Array = self.at_rest(motion) + lasting * (speed + ACCELERATED * acceleration)
+        return total
 
     def of_row(self, noise: Array, motion: Motion, rows: float = INDEPENDENT_HZ * OPTIONS.lasting_s) -> Array:
         """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)².

@@ -10,11 +10,20 @@ from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.base import LinearKernel, Params, PartialKernel, Regressor
-from lipcore.kernels.drive.terms import SHAPE_SPEEDS, SIGN_WIDTH, STRIBECK_SPEED, check_kinds, drive_terms
+from lipcore.kernels.base import LinearKernel, Params, PartialKernel, Regressor, State, constant, on_diagonal, reordered
+from lipcore.kernels.drive.play import deflections_of
+from lipcore.kernels.drive.terms import (
+    SHAPE_SPEEDS,
+    SIGN_WIDTH,
+    STRIBECK_SPEED,
+    check_kinds,
+    drive_features,
+    drive_terms,
+)
 from lipcore.kernels.fast.drive import drive_queries, drive_query, drive_size, linear_features
 from lipcore.kernels.fast.views import Memory
 from lipcore.kernels.geometry import Geometry
+from lipcore.kernels.newton_euler import rigid_body_torque
 from lipcore.vocabulary import DRIVE_KINDS, DriveKind
 
 
@@ -75,6 +84,20 @@ class Drive:
         """The regressor that computes the terms."""
         return DriveRegressor(self)
 
+    def formula(self, x: Motion) -> Array:
+        """Return each joint's terms at N queries, (f, N, n), in the array API. The arrays of x are of any library."""
+        load = known = None
+        if self.needs_bodies:
+            assert self.bodies is not None
+            geometry, order = self.bodies.geometry, self.bodies.order
+            chain = rigid_body_torque(geometry, self.bodies.parameters, State.paired(x).ordered(order))
+            load = reordered(chain, np.argsort(order)).T
+        if "play" in self.kinds:
+            assert self.elements is not None
+            widths = self.elements.widths
+            known = deflections_of(x, widths, self.elements.acceleration)[:, : len(widths)]
+        return drive_features(x.dq, self.kinds, x.q, load, known)
+
     def by_joint(self, motions: Array) -> Array:
         """Return each joint's terms, (N, n, f). motions: as of `Motion.arrays`."""
         return self.regressor.linear(motions)[:, :, 1:]
@@ -96,6 +119,17 @@ class DriveKernel(LinearKernel):
 
     def __init__(self, drive: Drive) -> None:
         self.n_joints, self.drive = drive.n_joints, drive
+
+    def formula(self, x: Motion) -> Array:
+        """Return Φᵀ of N queries, (f n, n, N), see `LinearKernel.formula`."""
+        xp, terms = array_namespace(x.dq), self.drive.formula(x)
+        of_joints = on_diagonal(xp.permute_dims(terms, (2, 0, 1)))
+        return xp.permute_dims(of_joints, (1, 2, 0, 3)).reshape(-1, self.n_joints, len(x))
+
+    def weighted(self, weights: Array, x: Motion) -> Array:
+        """Return Φ w of N queries, (n, N), without the features; see `LinearKernel.weighted`."""
+        terms = self.drive.formula(x)
+        return (terms * constant(weights.reshape(self.n_joints, -1).T[:, None], terms)).sum(0).T
 
     def regressor(self) -> Regressor:
         """Return the regressor that computes the terms of single queries."""

@@ -25,10 +25,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
+from lipcore.kernels.base import constant
 from lipcore.kernels.fast.play import CERTAIN_SHARE, POSITIONS, follow
 
 ELEMENTS = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
@@ -114,21 +116,22 @@ def with_deflections(samples: Samples, joint_types: Sequence[str]) -> Samples:
 def deflections_of(motion: Motion, widths: Array, acceleration: Array) -> Array:
     """Return the deflections of N instants, (N, 2 K, n): those of the motion before, or of the instant if more certain.
 
-    widths: (K, n); acceleration: usual one, (n,).
+    widths: (K, n); acceleration: usual one, (n,). The arrays of the motion are of any library.
     """
     alone = deflections_at(motion.dq, motion.ddq, widths, acceleration)
     if motion.deflections is None:
         return alone
-    certain = np.tile(motion.deflections[:, len(widths) :] <= alone[:, len(widths) :], (1, 2, 1))
-    return np.where(certain, motion.deflections, alone)
+    xp, certain = array_namespace(alone), motion.deflections[:, len(widths) :] <= alone[:, len(widths) :]
+    return xp.where(xp.concat([certain, certain], axis=1), motion.deflections, alone)
 
 
 def deflections_at(dq: Array, ddq: Array, widths: Array, acceleration: Array) -> Array:
     """Return the deflections of N instants alone, (N, 2 K, n) as in `Motion`.
 
-    dq, ddq: (N, n); widths: (K, n); acceleration: usual one, (n,).
+    dq, ddq: (N, n), of any library; widths: (K, n); acceleration: usual one, (n,).
     """
-    size = np.hypot(ddq, CERTAIN_SHARE * acceleration)
-    stroke = (dq * np.abs(dq) / (2 * size))[:, None] / widths
-    expected = np.clip(stroke - (ddq / size)[:, None], -1.0, 1.0)
-    return np.concatenate([expected, np.exp(-np.abs(stroke) / 2)], axis=1)
+    xp = array_namespace(dq)
+    size = xp.sqrt(ddq * ddq + constant(np.square(CERTAIN_SHARE * acceleration), dq))
+    stroke = (dq * xp.abs(dq) / (2 * size))[:, None] / constant(widths, dq)
+    expected = xp.clip(stroke - (ddq / size)[:, None], -1.0, 1.0)
+    return xp.concat([expected, xp.exp(-xp.abs(stroke) / 2)], axis=1)

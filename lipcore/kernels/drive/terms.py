@@ -24,6 +24,7 @@ from collections.abc import Iterable, Sequence
 from typing import cast
 
 import numpy as np
+from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array
 from lipcore.kernels.drive.play import ELEMENTS
@@ -75,32 +76,33 @@ def drive_features(
     load: Array | None = None,
     deflections: Array | None = None,
 ) -> Array:
-    """Return the terms of N velocities, (f, N, n).
+    """Return the terms of N velocities, (f, N, n), in the array API.
 
     dq: (N, n) rad/s (m/s); q: (N, n) rad (m), for the kind `position`; load: (N, n) N·m (N), the torque that the bodies
     need, for the kinds `load` and `gain`; deflections: (N, K, n), expected ones, for the kind `play`.
     """
-    sign, speed = np.tanh(dq / SIGN_WIDTH), np.abs(dq)
-    parts = [dq, sign, np.ones_like(dq)]
+    xp = array_namespace(dq)
+    sign, speed = xp.tanh(dq / SIGN_WIDTH), xp.abs(dq)
+    parts = [dq, sign, xp.ones_like(dq)]
     if "stribeck" in kinds:
-        parts.append(sign * np.exp(-((dq / STRIBECK_SPEED) ** 2)))
+        parts.append(sign * xp.exp(-((dq / STRIBECK_SPEED) ** 2)))
     if "speed" in kinds:
-        parts += [*(np.tanh(dq / each) for each in SHAPE_SPEEDS), dq * speed]
+        parts += [*(xp.tanh(dq / each) for each in SHAPE_SPEEDS), dq * speed]
     if "sides" in kinds:
-        parts += [np.abs(sign), speed]
+        parts += [xp.abs(sign), speed]
     if "position" in kinds:
         assert q is not None  # the caller has it
-        parts += [turn(number * q) for number in WAVES for turn in (np.sin, np.cos)]
+        parts += [turn(number * q) for number in WAVES for turn in (xp.sin, xp.cos)]
     if "load" in kinds:
         assert load is not None  # the caller computes it
-        parts += [np.abs(load) * sign, np.abs(load) * dq]
+        parts += [xp.abs(load) * sign, xp.abs(load) * dq]
     if "gain" in kinds:
         assert load is not None
         parts.append(load)
     if "play" in kinds:
         assert deflections is not None  # the caller computes them
-        parts += list(deflections.swapaxes(0, 1))
-    return np.stack(parts)
+        parts += [deflections[:, k] for k in range(deflections.shape[1])]
+    return xp.stack(parts)
 
 
 def passing_row(kinds: Sequence[DriveKind]) -> Array:

@@ -285,6 +285,17 @@ def test_gradient_equals_automatic_differentiation(name: str, joint_types: tuple
             np.testing.assert_allclose(found[key], expected, rtol=0, atol=bound, err_msg=key)
 
 
+def check_array_api(kernel: LinearKernel, query: Motion, expected: Array, share: float) -> None:
+    """Check the formula of features Φᵀ, (p, n, N), and of their weighted sum, by NumPy and by PyTorch."""
+    weights = np.random.default_rng(7).standard_normal(len(expected))
+    total = np.einsum("p,pjk->jk", weights, expected)
+    parts = query.q, query.dq, query.ddq, query.deflections
+    tensors = Motion(*(None if each is None else torch.from_numpy(each) for each in parts))
+    for motion in (query, tensors):
+        assert_close(np.asarray(kernel.formula(motion)), expected, share)
+        assert_close(np.asarray(kernel.weighted(weights, motion)), total, 10 * share)
+
+
 @pytest.mark.each_once
 @robots
 @every_kernel
@@ -312,3 +323,4 @@ def test_query_covariances_equal_the_formula(name: str, joint_types: tuple[str, 
             kernel.regressor().fill(query.arrays()[0], one)
             assert np.array_equal(one, found[0, 1 : p + 1])
             assert_close(kernel.features(query), expected.transpose(0, 2, 1), case.share)
+            check_array_api(kernel, query, expected.transpose(1, 2, 0), case.share)
