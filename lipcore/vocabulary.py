@@ -55,6 +55,10 @@ GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
 """How the joint axes of rigid bodies are found: learnt from torque alone, learnt around a URDF or the arm of another
 unit, or fixed as given there."""
 
+ExportFormat = Literal["archive", "urdf", "mjcf", "c"]
+EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
+"""What a version is exported as: an archive for another service, or a format of `lipcore.export.formats`."""
+
 Prior = Literal["urdf", "zero"]
 PRIORS: tuple[Prior, ...] = get_args(Prior)
 """Prior mean of the inertial parameters: those of the URDF, or zero."""

@@ -20,7 +20,8 @@ from benchmarks.latency.targets import Target
 from benchmarks.timing import Timing, measure
 from benchmarks.workload import BenchError, simulator
 from lipcore.data.samples import Array
-from lipcore.export.c_writer import SOURCE, ModelOrigin, c_files
+from lipcore.export.c_writer import SOURCE, c_files
+from lipcore.export.origin import ModelOrigin
 from lipcore.files.persistence import load
 from lipcore.model.torque_model import TrainingRange
 from lipcore.robots.library import Robot, pinocchio

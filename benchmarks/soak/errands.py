@@ -182,13 +182,13 @@ def upload_recordings(desk: Desk, turn: int) -> None:
 
 
 def exchange_archives(desk: Desk, turn: int) -> None:
-    """Export a version, import it as another model and delete that; export C and URDF; upload and delete a robot."""
+    """Export a version, import it as another model and delete that; export C, URDF and MJCF; upload and delete a robot."""
     content = desk.ask("GET", f"/v1/models/{ARM}/export")
     kind = {"content-type": "application/x-tar"}
     desk.ask("POST", "/v1/models/import?name=copy&promotion=always", 201, content=content, headers=kind)
     desk.ask("DELETE", "/v1/models/copy", 204)
-    desk.ask("GET", f"/v1/models/{ARM}/export?format=c")
-    desk.ask("GET", f"/v1/models/{ARM}/urdf")
+    for name in ("c", "urdf", "mjcf"):
+        desk.ask("GET", f"/v1/models/{ARM}/export?format={name}")
     urdf = profile_urdf(PROFILE)
     robot = desk.ask("POST", "/v1/robots", 201, content=urdf, headers={"content-type": "application/xml"})["id"]
     desk.ask("GET", f"/v1/robots/{robot}")

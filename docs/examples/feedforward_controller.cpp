@@ -1,6 +1,6 @@
 // A controller in the style of ros2_control with an exported model as feedforward: no network, allocation or waiting.
 //
-//     lipserve models export panda-sim --c .
+//     lipserve models export panda-sim . --format c
 //     cc -O2 -c lipserve_model.c
 //     c++ -std=c++17 -O2 feedforward_controller.cpp lipserve_model.o -o controller
 //     ./controller 5000 0 0 0 -1.8 0 1.6 0     number of cycles, and the posture to move around (default: zero)

@@ -9,7 +9,7 @@ that its axis is z. The two vectors across the axis, about which the geometry st
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from string import Template
@@ -28,6 +28,7 @@ from lipcore.export.c_weights import (
     group_parameters,
     move_parameters,
 )
+from lipcore.export.origin import SELF_TEST_STATES, ModelOrigin, draw_states
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, PlayState, element_widths
@@ -46,22 +47,12 @@ from lipcore.vocabulary import DRIVE_KINDS, ROBOT_ESTIMATORS
 SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
 WIDE = 8
 """Columns of a panel of the root."""
-VECTORS = 16
+VECTORS = SELF_TEST_STATES
 """Queries of the self-test, half of them with PAYLOAD. Every second one has a state after TRAIL."""
 TRAIL = (0.3, -0.5, 0.004, 0.0)
 """Positions before a query, relative to its own, in units of the largest element. They deflect every element partly."""
 PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
 """Payload in half of the queries of the self-test."""
-
-
-@dataclass(frozen=True)
-class ModelOrigin:
-    """Origin of the exported files. model: name; version, revision: numbers; digest: of the model's tensors."""
-
-    model: str
-    version: int
-    revision: int
-    digest: str
 
 
 def c_files(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
@@ -268,9 +259,8 @@ def _full_panels(matrix: Array) -> Array:
 
 def _vectors(model: TorqueModel, learnt: LinearWeights) -> Array:
     """Return queries within the training's range, and the model's own predictions: (VECTORS, 5, n)."""
-    limits, draw, n = model.training_range, np.random.default_rng(0).uniform, model.n_joints
-    motions = [draw(limits[name]["min"], limits[name]["max"], (VECTORS, n)) for name in ("q", "dq", "ddq")]
-    out, half, widths = np.empty((VECTORS, 5, n)), VECTORS // 2, element_widths(model.joint_types)
+    motions, half, widths = draw_states(model).swapaxes(0, 1), VECTORS // 2, element_widths(model.joint_types)
+    out = np.empty((VECTORS, 5, model.n_joints))
     for carried, known in product((False, True), repeat=2):
         rows = slice(half * carried + known, half * (1 + carried), 2)
         q, dq, ddq = motion = [each[rows] for each in motions]

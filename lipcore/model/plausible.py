@@ -25,6 +25,22 @@ def is_plausible(body: Array) -> bool:
     return bool(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0)
 
 
+def nearest_solid(body: Array, least: float) -> Array:
+    """Return the ten parameters of the nearest body with a second moment of at least `least` kg·m² along every axis.
+
+    Mass, which must be positive, and centre of mass stay. The distance is that of the second moments about the centre
+    of mass (Frobenius norm). A body that has them is returned as it is.
+    """
+    mass, centre = body[0], body[1:4] / body[0]
+    spread = pseudo_inertia(body)[:3, :3] - mass * np.outer(centre, centre)
+    values, vectors = np.linalg.eigh(spread)
+    if values[0] >= least:
+        return body
+    spread = (vectors * np.maximum(values, least)) @ vectors.T + mass * np.outer(centre, centre)
+    inertia = np.trace(spread) * np.eye(3) - spread
+    return np.concatenate([body[:4], inertia[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]])
+
+
 def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: Array | None = None) -> Array:
     """Return the weights (p,) nearest to a mean (p,) that describe plausible bodies in their first 10 n elements.
 

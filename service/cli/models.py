@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
@@ -11,6 +10,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from lipcore.vocabulary import ExportFormat
 from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
@@ -257,54 +257,33 @@ def compare(
 @app.command("export")
 def export_(
     model: ModelVersion,
-    path: Annotated[Path | None, typer.Argument(help="Archive to write, .tar.", dir_okay=False)] = None,
-    c: Annotated[
-        Path | None,
-        typer.Option(
-            "--c", help="Write C code for control loops instead: folder for lipserve_model.c and .h.", file_okay=False
-        ),
-    ] = None,
+    path: Annotated[Path, typer.Argument(help="File to write; for the format c, the folder.")],
+    format: Annotated[  # noqa: A002 - the option's name
+        ExportFormat, typer.Option(help="archive: for another service. Others: rigid-body models only.")
+    ] = "archive",
     learnt: Annotated[
         bool, typer.Option(help="Include what was learnt online, or export the version as trained.")
     ] = True,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Export a version as an archive for another service, or with --c as C99 code for hard real time.
+    """Export a version: archive for another service, URDF, MJCF for MuJoCo, or C99 code for hard real time.
 
-    The C code computes torque and standard deviation of rigid-body models (also with `lip-chain`), with or without a
-    payload. It has no dependencies and does not allocate memory. Compile it with `cc -O2 -c lipserve_model.c`; see
-    lipserve_model.h for its use.
+    URDF and MJCF have physically possible bodies, friction and rotors. Comments state the largest torque error of each
+    joint. The C code computes torque and standard deviation, with or without a payload. It has no dependencies and does
+    not allocate memory; see lipserve_model.h for its use.
     """
-    if (path is None) == (c is None):
-        raise CommandError("give an archive to write or --c FOLDER" + ("" if c is None else ", not both"))
-    if c is not None:
-        with connected(url) as client:
-            client.export(model, c, learnt=learnt, format="c")
-        source, header = c / "lipserve_model.c", c / "lipserve_model.h"
-        text = f"{source} and {header}: {source.stat().st_size:,} bytes; `cc -O2 -c {source}` compiles it"
-        print_result({"source": source, "header": header}, as_json, text)
-        return
-    assert path is not None
     with connected(url) as client:
-        written = client.export(model, path, learnt=learnt)
-    size = written.stat().st_size
+        written = client.export(model, path, learnt=learnt, format=format)
+    files = sorted(written.iterdir()) if written.is_dir() else [written]
+    size = sum(each.stat().st_size for each in files)
+    notes = {
+        "archive": f"; `lipserve models import {written}` imports it",
+        "c": f"; `cc -O2 -c {written / 'lipserve_model.c'}` compiles it",
+    }
     print_result(
-        {"file": written, "bytes": size},
-        as_json,
-        f"{written}: {size:,} bytes; `lipserve models import {written}` imports it",
+        {"path": written, "format": format, "bytes": size}, as_json, f"{written}: {size:,} bytes{notes.get(format, '')}"
     )
-
-
-@app.command()
-def urdf(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Print the estimated arm of a version as a URDF: `lipserve models urdf NAME > arm.urdf`."""
-    with connected(url) as client:
-        text = client.urdf(model)
-    if as_json:
-        print_json({"urdf": text})
-    else:
-        sys.stdout.write(text)
 
 
 @app.command("import")

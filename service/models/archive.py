@@ -1,4 +1,4 @@
-"""Export a version: as an archive with checksums and origin, as C source, or its arm as a URDF.
+"""Export a version: as an archive with checksums and origin, or in a format of `lipcore.export.formats`.
 
 Archives are read by `archive_reading`.
 """
@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from lipcore.export.c_writer import ModelOrigin, c_files
-from lipcore.export.urdf_writer import urdf_of_parameters
+from lipcore.export.formats import FORMATS
+from lipcore.export.origin import ModelOrigin
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
-from lipcore.vocabulary import ROBOT_ESTIMATORS
+from lipcore.model.torque_model import TorqueModel
+from lipcore.vocabulary import ExportFormat
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
 from service.models import registry
 from service.models.archive_reading import BLOCK, CHECKSUMS, EXPORT, FORMAT, FORMAT_VERSION, padding
@@ -29,46 +30,44 @@ MEDIA_TYPE = "application/x-tar"
 
 
 @dataclass(frozen=True)
-class ArchiveFile:
-    """An archive that is ready to be sent.
+class ExportedFile:
+    """A file that is ready to be sent.
 
     `name` is the file name, `size` the length in bytes, `pieces` the content.
     """
 
     name: str
+    media_type: str
     size: int
     pieces: Iterator[bytes]
 
 
 def export(
-    loaded: LoadedModels, model: str, version: int | None, alias: str | None, learnt: bool, as_c: bool = False
-) -> ArchiveFile:
-    """Archive a version, or the serving version if none is named. Blocking: use it in a thread.
+    loaded: LoadedModels,
+    model: str,
+    version: int | None,
+    alias: str | None,
+    learnt: bool,
+    kind: ExportFormat = "archive",
+) -> ExportedFile:
+    """Export a version, or the serving version if none is named. Blocking: use it in a thread.
 
-    If `learnt`, include what the version has learnt online; else export it as trained. If `as_c`, write the C source
-    and header of `lipcore.export.c_writer`. Everything is checked before the first byte is sent. Raise NotFoundError,
-    InvalidRequestError for both a version and an alias or for an estimator without C export, UnreadableVersionError for
-    damaged files, StorageFullError.
+    If `learnt`, include what the version has learnt online; else export it as trained. A format of several files
+    becomes a tar. Everything is checked before the first byte is sent. Raise NotFoundError, InvalidRequestError for
+    both a version and an alias or for an estimator that the format cannot express, UnreadableVersionError for damaged
+    files, StorageFullError.
     """
     row = _find(loaded, model, version, alias)
     try:
         files, revision = _files(loaded, row, learnt)
-        decoded = persistence.decode(files) if as_c else None
+        origin = ModelOrigin(row.model, row.version, revision, persistence.sha256(files[TENSORS]))
+        if kind != "archive":
+            manifest = json.loads(files[MANIFEST]) if revision else row.manifest
+            return _export_as(kind, loaded, persistence.decode(files), manifest["parameters"], origin)
     except ModelFormatError as error:
         registry.find(loaded.database, row.model, row.version)  # raises if the version was deleted meanwhile
         message = f"version {row.version} of model {row.model!r} cannot be exported: {error}"
         raise UnreadableVersionError(message) from error
-    suffix = f"-r{revision}" if revision else ""
-    if decoded is not None:
-        origin = ModelOrigin(row.model, row.version, revision, persistence.sha256(files[TENSORS]))
-        try:
-            written = c_files(decoded, origin)
-        except ValueError as error:
-            item = problem("version", row.version, f"a version of estimator {', '.join(ROBOT_ESTIMATORS)}")
-            message = f"version {row.version} of model {row.model!r} cannot be written as C: {error}"
-            raise InvalidRequestError(message, [item]) from error
-        file = _packed(loaded, {name: text.encode() for name, text in written.items()})
-        return ArchiveFile(f"{row.model}-v{row.version}{suffix}-c.tar", file.tell(), _pieces(file))
     about = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -83,7 +82,25 @@ def export(
     files = {EXPORT: _json(about), **files}
     sums = _json({name: persistence.sha256(content) for name, content in files.items()})
     file = _packed(loaded, {CHECKSUMS: sums, **files})
-    return ArchiveFile(f"{row.model}-v{row.version}{suffix}.tar", file.tell(), _pieces(file))
+    return ExportedFile(f"{origin.stem}.tar", MEDIA_TYPE, file.tell(), _pieces(file))
+
+
+def _export_as(
+    kind: ExportFormat, loaded: LoadedModels, model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin
+) -> ExportedFile:
+    """Return a model in one of FORMATS; raise InvalidRequestError if the format cannot express it."""
+    form = FORMATS[kind]
+    try:
+        files = form.write(model, parameters, origin)
+    except ValueError as error:
+        item = problem("version", origin.version, f"a version of estimator {', '.join(form.estimators)}")
+        message = f"version {origin.version} of model {origin.model!r} cannot be written as {kind}: {error}"
+        raise InvalidRequestError(message, [item]) from error
+    if form.media_type is not None:
+        ((name, content),) = files.items()
+        return ExportedFile(name, form.media_type, len(content), iter((content,)))
+    file = _packed(loaded, files)
+    return ExportedFile(f"{origin.stem}-{kind}.tar", MEDIA_TYPE, file.tell(), _pieces(file))
 
 
 def _find(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> VersionRow:
@@ -147,42 +164,3 @@ def _pieces(file: IO[bytes]) -> Iterator[bytes]:
 
 def _json(value: Any) -> bytes:
     return json.dumps(value, indent=2, allow_nan=False).encode() + b"\n"
-
-
-URDF_MEDIA_TYPE = "application/xml"
-URDF_EXAMPLE = """<?xml version="1.0"?>
-<robot name="arm-v2" xmlns:drake="http://drake.mit.edu">
-  <link name="base" />
-  <joint name="joint1" type="revolute">
-    <origin xyz="0.0 0.0 0.333" rpy="0.0 0.0 0.0" />
-    <parent link="base" />
-    <child link="joint1_link" />
-    <axis xyz="0.0 0.0 1.0" />
-    <limit lower="-2.1" upper="2.3" velocity="1.4" effort="1900.0" />
-    <dynamics damping="0.12" friction="0.41" />
-  </joint>
-  <link name="joint1_link">
-    <inertial>
-      <origin xyz="0.0 -0.02 -0.05" rpy="0.0 0.0 0.0" />
-      <mass value="2.9" />
-      <inertia ixx="0.02" ixy="0.0" ixz="0.0" iyy="0.02" iyz="0.0" izz="0.01" />
-    </inertial>
-  </link>
-</robot>
-"""
-
-
-def write_urdf(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> tuple[str, str]:
-    """Return a file name and the URDF of a version, of the serving version if none is named.
-
-    Raise NotFoundError, or InvalidRequestError for both a version and an alias or for a version without an arm.
-    """
-    row = _find(loaded, model, version, alias)
-    name, manifest = f"{row.model}-v{row.version}", row.manifest
-    try:
-        text = urdf_of_parameters(manifest["parameters"], manifest["joint_names"], manifest["training_range"], name)
-    except ValueError as error:
-        item = problem("version", row.version, "a version with rigid bodies and a learnt geometry")
-        message = f"version {row.version} of model {row.model!r} cannot be written as a URDF: {error}"
-        raise InvalidRequestError(message, [item]) from error
-    return f"{name}.urdf", text

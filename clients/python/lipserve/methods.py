@@ -120,7 +120,6 @@ class Calls:
     remove_alias = One(calls.models.remove_alias)
     rollback_alias = One(calls.models.rollback_alias)
     export = One(calls.models.export)
-    urdf = One(calls.models.urdf)
     import_model = One(calls.models.import_model)
     audit = Listed(calls.models.audit)
 

@@ -22,7 +22,8 @@ from lipcore.data.samples import Samples
 from lipcore.estimators.catalogue import make_estimator
 from lipcore.estimators.task import Task
 from lipcore.export.c_weights import UnsupportedEstimatorError
-from lipcore.export.c_writer import HEADER, SOURCE, ModelOrigin, c_files
+from lipcore.export.c_writer import HEADER, SOURCE, c_files
+from lipcore.export.origin import ModelOrigin
 from lipcore.kernels.base import PairKernel
 from lipcore.kernels.drive.play import ELEMENTS, MAX_GAP_S, PlayState, element_widths
 from lipcore.kernels.drive.terms import drive_terms

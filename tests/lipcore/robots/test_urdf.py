@@ -9,7 +9,8 @@ import pytest
 
 from lipcore import FitOptions
 from lipcore.estimators.catalogue import MissingRobotError, UnknownEstimatorError, check_estimator, make_estimator
-from lipcore.export.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
+from lipcore.export.simulated_arm import ArmJoints, SimulatedArm
+from lipcore.export.urdf_writer import rpy, urdf_text
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.fast.arm import arm_torques
 from lipcore.kernels.geometry import rotation_of
@@ -271,7 +272,7 @@ def test_urdf_torque_matches_the_arm(kinds: str, gravity: bool) -> None:
     geometry, bodies = random_geometry(kinds, seed, gravity), random_bodies(n, seed)
     order, names = rng.permutation(n), [f"joint {letter}" for letter in "edcbagf"[:n]]
     report = parameters(geometry, bodies, names, order.tolist())
-    urdf = urdf_of_parameters(report, names, training_range(n))
+    urdf = urdf_text(SimulatedArm.of_parameters(report, names, training_range(n)))
     assert (pin.buildModelFromXML(urdf).effortLimit > 0).all()
     motions = rng.normal(0, 1.5, (20, 3, n))
     expected = np.empty((20, n))
@@ -288,7 +289,7 @@ def test_names_and_numbers_are_kept() -> None:
     words = tuple(("mass", "shift 1") if k == 2 else () for k in range(5))
     numbers = np.arange(5.0)
     given = joints(names, lower=-numbers, upper=numbers, offset=numbers, undetermined=words)
-    urdf = urdf_text(geometry, random_bodies(5, 3), given, 'my "arm"')
+    urdf = urdf_text(SimulatedArm(geometry, random_bodies(5, 3), given, np.arange(5)), 'my "arm"')
     model = pin.buildModelFromXML(urdf)
     assert model.names[1:].tolist() == names
     assert model.name == 'my "arm"'
@@ -301,9 +302,11 @@ def test_names_and_numbers_are_kept() -> None:
 
 
 def test_negative_friction_is_written_as_zero() -> None:
-    urdf = urdf_text(random_geometry("R", 1), random_bodies(1, 1), joints(["a"], viscous=np.array([-0.5])))
-    weak = replace(random_geometry("R", 1), gravity=random_geometry("R", 1).gravity / 6)
-    assert "set it in the simulator" in urdf_text(weak, random_bodies(1, 1), joints(["a"]))
+    given = joints(["a"], viscous=np.array([-0.5]))
+    arm = SimulatedArm(random_geometry("R", 1), random_bodies(1, 1), given, np.arange(1))
+    urdf = urdf_text(arm)
+    weak = replace(arm.geometry, gravity=arm.geometry.gravity / 6)
+    assert "set it in the simulator" in urdf_text(replace(arm, geometry=weak))
     assert 'damping="0.0"' in urdf
     assert "learnt damping is -0.5" in urdf
 
@@ -319,10 +322,10 @@ def test_angles_match_the_rotation(pitch: float) -> None:
 def test_impossible_urdf_is_rejected() -> None:
     report, names = parameters(random_geometry("RR", 1), random_bodies(2, 1), ["a", "b"], [0, 1]), ["a", "b"]
     with pytest.raises(ValueError, match="no rigid bodies"):
-        urdf_of_parameters({"friction": report["friction"]}, names, training_range(2))
+        SimulatedArm.of_parameters({"friction": report["friction"]}, names, training_range(2))
     report["inertia"]["bodies"][1]["plausible"]["mass"] = -1.0
     with pytest.raises(ValueError, match="joint 'b' moves is -1 kg"):
-        urdf_of_parameters(report, names, training_range(2))
+        SimulatedArm.of_parameters(report, names, training_range(2))
     with pytest.raises(ValueError, match=r"names\[1\] is 'a'"):
         joints(["a", "a"])
     with pytest.raises(ValueError, match="lower is"):
@@ -330,4 +333,4 @@ def test_impossible_urdf_is_rejected() -> None:
     with pytest.raises(ValueError, match="rotor is"):
         joints(["a"], rotor=np.array([np.nan]))
     with pytest.raises(ValueError, match="bodies has shape"):
-        urdf_text(random_geometry("RR", 1), random_bodies(3, 1), joints(["a", "b"]))
+        SimulatedArm(random_geometry("RR", 1), random_bodies(3, 1), joints(["a", "b"]), np.arange(2))

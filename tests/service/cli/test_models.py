@@ -80,25 +80,26 @@ def test_archive_is_exported_imported_and_deleted(run_command, arm, run_rejected
 
 def test_version_is_exported_as_c(run_command, run_rejected_command, arm, robot_arm, tmp_path):
     folder, export = tmp_path / "made" / "c", ("models", "export", robot_arm)
-    written = run_command(*export, "--c", folder, "--json")
-    assert sorted(written.values()) == sorted(map(str, folder.iterdir()))
+    written = run_command(*export, folder, "--format", "c", "--json")
+    assert (written["path"], written["format"]) == (str(folder), "c")
+    assert sorted(each.name for each in folder.iterdir()) == ["lipserve_model.c", "lipserve_model.h"]
     assert f'#define LIPSERVE_MODEL "{robot_arm}"' in (folder / "lipserve_model.h").read_text()
-    assert "cc -O2 -c" in run_command(*export, "--c", folder)
-    message = run_rejected_command("models", "export", f"{arm[0]}@1", "--c", tmp_path / "none")
+    assert "cc -O2 -c" in run_command(*export, folder, "--format", "c")
+    message = run_rejected_command("models", "export", f"{arm[0]}@1", tmp_path / "none", "--format", "c")
     assert "estimator is 'se', expected one of rigid-body" in message
     assert not (tmp_path / "none").exists()
-    both = "give an archive to write or --c FOLDER, not both"
-    assert both in run_rejected_command(*export, "x.tar", "--c", folder)
-    assert "give an archive to write or --c FOLDER\n" in run_rejected_command(*export)
 
 
-def test_estimated_arm_is_shown(run_command, run_rejected_command, robot_arm):
+def test_estimated_arm_is_shown(run_command, run_rejected_command, robot_arm, tmp_path):
     parts = ("joint frames", "rotor kg·m²", "mass, first moment", "shift 2", "mirror image", "-0.05 ± 0.01")
     text = run_command("models", "show", f"{robot_arm}@1")
     assert lacking(text, f"warning: {WARNING}", *parts) == []
     assert "mirror image" not in run_command("models", "show", robot_arm)
-    assert describe(run_command("models", "urdf", f"{robot_arm}@1")).joint_names == JOINTS
-    assert "has no rigid bodies" in run_rejected_command("models", "urdf", robot_arm)
+    urdf = ("--format", "urdf")
+    assert "arm.urdf: " in run_command("models", "export", f"{robot_arm}@1", tmp_path / "arm.urdf", *urdf)
+    assert describe((tmp_path / "arm.urdf").read_text()).joint_names == JOINTS
+    assert "has no rigid bodies" in run_rejected_command("models", "export", robot_arm, tmp_path / "no.urdf", *urdf)
+    assert not (tmp_path / "no.urdf").exists()
 
 
 @pytest.mark.parametrize(

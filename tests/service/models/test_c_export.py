@@ -76,7 +76,7 @@ def test_c_file_includes_online_learning(api, arm, tmp_path):
 
 def test_other_estimators_and_formats_are_rejected(api, arm):
     refusal = error(api.get("/v1/models/c-none/export", params={"format": "c"}), 422, "invalid_request")
-    assert "version 1 of model 'c-none' cannot be written as C: estimator is" in refusal["message"]
+    assert "version 1 of model 'c-none' cannot be written as c: estimator is" in refusal["message"]
     estimators = "rigid-body, rigid-body+local, rigid-body+lip-chain"
     expected = {"field": "version", "expected": f"a version of estimator {estimators}"}
     assert refusal["detail"][0].items() >= expected.items()

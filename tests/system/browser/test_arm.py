@@ -115,12 +115,10 @@ def test_arm_is_drawn_and_moves_with_the_sliders(visitor: Visitor, arm: str) -> 
     expect(parameters.get_by_role("columnheader", name="Coulomb, N·m")).to_be_visible()
     page.get_by_role("region", name="Learnt arm").get_by_text("How to read this").click()
     expect(page.get_by_text("does not distinguish an arm from its mirror image")).to_be_visible()
-    with page.expect_download() as saved:
-        page.get_by_role("button", name="Save as URDF").click()
-    assert saved.value.suggested_filename == "drawn-v1.urdf"
-    with page.expect_download() as saved:
-        page.get_by_role("button", name="Save as C").click()
-    assert saved.value.suggested_filename == "drawn-v1-c.tar"
+    for label, file in (("URDF", "drawn-v1.urdf"), ("MJCF (MuJoCo)", "drawn-v1.xml"), ("C", "drawn-v1-c.tar")):
+        with page.expect_download() as saved:
+            page.get_by_role("button", name=f"Save as {label}", exact=True).click()
+        assert saved.value.suggested_filename == file
     assert audit(page) == []
     visitor.shot("arm", height=1500)
     # resize the window: a new one would compile the 3-D code again

@@ -155,8 +155,8 @@ def retry(_route: Route, job: str, *, idempotency_key: str | None = None) -> Cal
 
 ARCHIVE_TIMEOUT = 600.0
 """Max time for the service to pack or check an archive, s."""
-C_FILES = ("lipserve_model.c", "lipserve_model.h")
-"""Files of a version that is exported as C."""
+FILE_FORMATS = ("archive", "urdf", "mjcf")
+"""Formats of one file. The others are folders, sent as a tar."""
 
 
 @route("GET", "/v1/models")
@@ -275,49 +275,39 @@ def export(
     version: int | None = None,
     alias: str | None = None,
     learnt: bool = True,
-    format: Literal["archive", "c"] = "archive",  # noqa: A002 - the API's own name
+    format: Literal["archive", "urdf", "mjcf", "c"] = "archive",  # noqa: A002 - the API's own name
 ) -> Call[Path]:
-    """Export a version as an archive for `import_model`, or as C code.
+    """Export a version as an archive for `import_model`, or for simulators and control loops.
 
     Args:
         model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
-        path: Archive to write; it is written completely or not at all. For C: the folder.
+        path: File to write; it is written completely or not at all. For `c`: the folder.
         version: Version number. Default: the serving version.
         alias: Alias of the version, instead of its number.
         learnt: Include what was learnt online; else export the version as trained.
-        format: `archive`, or `c` for `lipserve_model.c` and `lipserve_model.h` (rigid-body models only).
+        format: `archive`; or, for rigid-body models only, `urdf`, `mjcf` (MuJoCo), or `c` for `lipserve_model.c` and
+            `lipserve_model.h`.
 
     Returns:
         The path.
+
+    Example:
+        >>> client.export("my-arm", "my-arm.xml", format="mjcf").name
+        'my-arm.xml'
     """
     path = Path(path)
 
     def read(answer: Answer) -> Path:
-        if format == "c":
+        if format not in FILE_FORMATS:
             path.mkdir(parents=True, exist_ok=True)
             with tarfile.open(fileobj=io.BytesIO(answer.body)) as archive:
-                for name in C_FILES:
-                    content = archive.extractfile(name)
-                    assert content is not None  # a regular file
-                    (path / name).write_bytes(content.read())
+                archive.extractall(path, filter="data")
         return path
 
     name, which = split_name(model, version, alias)
-    params = which | {"learnt": learnt}
-    if format == "c":
-        return _route(read, names={"model": name}, params={**params, "format": format}, timeout=ARCHIVE_TIMEOUT)
-    return _route(read, names={"model": name}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
-
-
-@route("GET", "/v1/models/{model}/urdf")
-def urdf(_route: Route, model: str, version: int | None = None, alias: str | None = None) -> Call[str]:
-    """Return the estimated arm of a version (default: the serving one) as the text of a URDF.
-
-    Raises:
-        ApiError: The estimator has no rigid bodies.
-    """
-    name, which = split_name(model, version, alias)
-    return _route(lambda answer: answer.body.decode(), names={"model": name}, params=which)
+    params = which | {"learnt": learnt, "format": format}
+    save_to = path if format in FILE_FORMATS else None
+    return _route(read, names={"model": name}, params=params, save_to=save_to, timeout=ARCHIVE_TIMEOUT)
 
 
 @route("POST", "/v1/models/import")

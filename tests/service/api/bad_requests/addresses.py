@@ -17,7 +17,7 @@ from tests.service.api.bad_requests.bad import (
     get,
 )
 
-MODELS, EXPORT, URDF = "/v1/models", "/v1/models/panda-sim/export", "/v1/models/panda-sim/urdf"
+MODELS, EXPORT = "/v1/models", "/v1/models/panda-sim/export"
 NO_ROUTES = (
     *("/dashboard", "/dashboard/%2e%2e/routes.py", "/v1", "//v1/models", "/v1/models/", "/V1/models", "/v1/models;x=1"),
     *("/v1/models%00", "/v1/models/%2e%2e/%2e%2e/etc/passwd", "/v1/datasets/..%2f..%2fetc%2fpasswd"),
@@ -42,8 +42,7 @@ MISSING = (
     *(("GET", f"{MODELS}/nobody/versions/1", "model"), ("GET", f"{MODELS}/panda-sim/versions/99", "version")),
     *(("DELETE", f"{MODELS}/panda-sim/versions/99", "version"), ("DELETE", f"{ALIASES}/no", "alias")),
     *(("POST", f"{ALIASES}/no/rollback", "alias"), ("GET", f"{EXPORT}?version=99", "version")),
-    *(("GET", f"{EXPORT}?alias=nobody", "alias"), ("GET", f"{URDF}?version=99", "version")),
-    ("GET", f"{URDF}?alias=nobody", "alias"),
+    *(("GET", f"{EXPORT}?alias=nobody", "alias"), ("GET", f"{EXPORT}?version=99&format=urdf", "version")),
 )
 """Paths of things that do not exist, and the field that the error names."""
 
@@ -82,11 +81,11 @@ PARAMETERS = [
     get(f"{DATASETS}?%E2%80%AElimit=1", "\\u202elimit"),
     get(f"{DATASETS}?=1", "query"),
     get(f"{DATASETS}?{'&'.join(f'a{i}=1' for i in range(101))}", "query"),
-    *(get(f"{path}?version={value}", "version") for path in (EXPORT, URDF) for value in ("0", "x", "2147483648")),
-    *(get(f"{path}?alias={value}", "alias") for path in (EXPORT, URDF) for value in ("", "A", "a%00")),
-    *(get(f"{path}?version=1&alias=serving", "version or alias") for path in (EXPORT, URDF)),
+    *(get(f"{EXPORT}?version={value}", "version") for value in ("0", "x", "2147483648")),
+    *(get(f"{EXPORT}?alias={value}", "alias") for value in ("", "A", "a%00")),
+    get(f"{EXPORT}?version=1&alias=serving", "version or alias"),
     get(f"{EXPORT}?learnt=perhaps", "learnt"),
-    get(f"{URDF}?v=1", "v"),
+    get(f"{EXPORT}?v=1", "v"),
     get(f"{OBSERVE}?rejected=perhaps", "rejected"),
     get(f"{OBSERVE}?stream_id=a%20b", "stream_id"),
     get(f"{OBSERVE}/cell-3/0?rows=2", "rows"),

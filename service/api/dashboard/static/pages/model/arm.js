@@ -8,7 +8,7 @@ import { html, useMemo, useRef, useState } from "../../preact.js";
 import { AMBIGUITY_NOTE, drawable, drawing, LEGEND } from "../arm/drawing.js";
 import { AxisTable, ParameterTable } from "../arm/tables.js";
 import { Dial, middle } from "./dial.js";
-import { saveC, saveUrdf } from "./export.js";
+import { ARM_FORMATS, exportVersion } from "./export.js";
 
 const DEGREES = 180 / Math.PI;
 const WIDE = 500; // px
@@ -22,8 +22,7 @@ export function Arm({ model: { name }, version }) {
           ${drawable() ? html`<${Figure} version=${version} />` : html`<p class="hint">3-D drawing is not available: WebGL is off in this browser. The tables contain the same values.</p>`}
           <details class="hint"><summary>How to read this</summary><p>${LEGEND}${orientationNote(geometry.gravity)} ${AMBIGUITY_NOTE}</p></details>
           <div class="actions">
-            <${Button} onclick=${() => saveUrdf(name, version.version)}>Save as URDF<//>
-            ${version.estimator === "rigid-body" && html`<${Button} onclick=${() => saveC(name, version.version)}>Save as C<//>`}
+            ${Object.entries(ARM_FORMATS).map(([format, label]) => html`<${Button} key=${format} onclick=${() => exportVersion(name, version.version, format)}>Save as ${label}<//>`)}
           </div>
         <//>`
       : html`<p class="empty">This version has no arm: its estimator does not learn rigid bodies. Train a version with the estimator rigid-body.</p>`}

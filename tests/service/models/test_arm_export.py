@@ -1,10 +1,15 @@
-"""Export of the arm that a version has learnt as a URDF."""
+"""Export of the arm that a version has learnt as URDF and MJCF."""
+
+import json
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from lipcore.export.formats import FORMATS
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.urdf import RigidBody
+from lipcore.vocabulary import EXPORT_FORMATS
 from tests.service.data import error, service_of
 from tests.service.models.versions import JOINTS, NO_BODIES, panda, publish_arm
 
@@ -18,8 +23,16 @@ def arm(api) -> str:
     return "urdf-arm"
 
 
+def export(api, model: str, kind: str, **params):
+    return api.get(f"/v1/models/{model}/export", params={"format": kind, **params})
+
+
+def test_every_format_has_a_writer():
+    assert ("archive", *FORMATS) == EXPORT_FORMATS
+
+
 def test_urdf_describes_the_robot(api, arm):
-    answer = api.get(f"/v1/models/{arm}/urdf")
+    answer = export(api, arm, "urdf")
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/xml"
     assert answer.headers["content-disposition"] == 'attachment; filename="urdf-arm-v2.urdf"'
@@ -30,16 +43,28 @@ def test_urdf_describes_the_robot(api, arm):
     np.testing.assert_allclose(Geometry.from_robot(robot).constants, expected, atol=1e-12)
 
 
+def test_mjcf_has_bodies_joints_and_origin(api, arm):
+    answer = export(api, arm, "mjcf", version=1)
+    assert answer.headers["content-disposition"] == 'attachment; filename="urdf-arm-v1.xml"'
+    root = ElementTree.fromstring(answer.text)
+    assert [each.get("name") for each in root.iter("joint")] == list(JOINTS)
+    about = json.loads(root.find("custom/text").get("data"))
+    assert (about["model"], about["version"], about["revision"]) == (arm, 1, 0)
+    masses = [float(each.get("mass")) for each in root.iter("inertial")]
+    np.testing.assert_allclose(masses, panda().parameters()[:, 0])
+
+
 def test_version_is_named_by_number_or_alias(api, arm):
     assert api.put(f"/v1/models/{arm}/aliases/best", json={"version": 2}).status_code == 200
     for params in ({"version": 2}, {"alias": "best"}, {"alias": "serving"}):
-        assert api.get(f"/v1/models/{arm}/urdf", params=params).status_code == 200, params
+        assert export(api, arm, "urdf", **params).status_code == 200, params
     for params, status in (({"version": 3}, 404), ({"alias": "no"}, 404), ({"alias": "best", "version": 2}, 422)):
-        assert api.get(f"/v1/models/{arm}/urdf", params=params).status_code == status, params
+        assert export(api, arm, "urdf", **params).status_code == status, params
 
 
-def test_version_without_an_arm_is_rejected(api, arm):
-    refusal = error(api.get("/v1/models/urdf-none/urdf", params={"version": 1}), 422, "invalid_request")
+@pytest.mark.parametrize("kind", ["urdf", "mjcf"])
+def test_version_without_an_arm_is_rejected(api, arm, kind):
+    refusal = error(export(api, "urdf-none", kind, version=1), 422, "invalid_request")
     assert "version 1 of model 'urdf-none'" in refusal["message"]
     assert "no rigid bodies" in refusal["message"]
     assert refusal["detail"][0]["field"] == "version"

@@ -1,0 +1,53 @@
+"""The formats that a model is exported in, beside the archive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from lipcore.export.c_writer import c_files
+from lipcore.export.mjcf_writer import mjcf_text
+from lipcore.export.origin import ModelOrigin
+from lipcore.export.sheet import Sheet
+from lipcore.export.simulated_arm import SimulatedArm
+from lipcore.export.urdf_writer import urdf_text
+from lipcore.model.torque_model import TorqueModel
+from lipcore.vocabulary import ROBOT_ESTIMATORS, ExportFormat
+
+Writer = Callable[[TorqueModel, Mapping[str, Any], ModelOrigin], dict[str, bytes]]
+"""Returns files by name. The second argument is `parameters` of the model's manifest. Raises ValueError for a model
+that the format cannot express."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of one file, or of a folder of files."""
+
+    write: Writer
+    estimators: tuple[str, ...]
+    """Estimators that it can express."""
+    media_type: str | None = None
+    """Type of its only file; None for a folder."""
+
+
+def _write_urdf(model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin) -> dict[str, bytes]:
+    arm = SimulatedArm.of_parameters(parameters, model.joint_names, model.training_range)
+    return {f"{origin.stem}.urdf": urdf_text(arm, origin.stem, Sheet.of(model, arm, origin)).encode()}
+
+
+def _write_mjcf(model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin) -> dict[str, bytes]:
+    arm = SimulatedArm.of_parameters(parameters, model.joint_names, model.training_range)
+    return {f"{origin.stem}.xml": mjcf_text(arm, origin.stem, Sheet.of(model, arm, origin)).encode()}
+
+
+def _write_c(model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin) -> dict[str, bytes]:
+    return {name: text.encode() for name, text in c_files(model, origin).items()}
+
+
+FORMATS: dict[ExportFormat, Format] = {
+    "urdf": Format(_write_urdf, ROBOT_ESTIMATORS, "application/xml"),
+    "mjcf": Format(_write_mjcf, ROBOT_ESTIMATORS, "application/xml"),
+    "c": Format(_write_c, ROBOT_ESTIMATORS),
+}
+"""All formats of `EXPORT_FORMATS` but the archive."""
