@@ -182,7 +182,7 @@ def upload_recordings(desk: Desk, turn: int) -> None:
 
 
 def exchange_archives(desk: Desk, turn: int) -> None:
-    """Export a version, import it as another model and delete that; export C, URDF and MJCF; upload and delete a robot."""
+    """Export a version in all formats, import it as another model and delete that; upload and delete a robot."""
     content = desk.ask("GET", f"/v1/models/{ARM}/export")
     kind = {"content-type": "application/x-tar"}
     desk.ask("POST", "/v1/models/import?name=copy&promotion=always", 201, content=content, headers=kind)

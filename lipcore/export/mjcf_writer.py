@@ -2,7 +2,8 @@
 
 `mj_inverse` plus Coulomb friction is the arm's torque if the option flag `frictionloss` is disabled. MuJoCo's own
 Coulomb friction is a constraint, whose force depends on the acceleration, too. Terms that a joint of MuJoCo cannot
-express are left out; comments have their largest torque. If gravity does not point down the base's z axis, the body `base` is turned.
+express are left out; comments have their largest torque. If gravity does not point down the base's z axis, the body
+`base` is turned.
 """
 
 from __future__ import annotations
