@@ -91,6 +91,10 @@ def show(model: ModelVersion, url: Url = DEFAULT_URL, as_json: Json = False) -> 
         paused = "; learning is paused until you decide" if learning.held is not None else ""
         learnt = f"revision {learning.published} of {learning.revision} serving"
         echo(f"  online learning: {learnt if learning.revision else 'nothing learnt yet'}{paused}")
+        for made in learning.exports:
+            state = "outdated" if made.outdated else "current"
+            at = made.at[:16].replace("T", " ")
+            echo(f"  exported as {made.format}: version {made.version}, revision {made.revision}, {at}: {state}")
     noted = any(each.note or each.tags for each in record.versions)
     table = Table("version", "verdict", "max error of range", "coverage", "estimator", "created", "aliases")
     if noted:

@@ -10,6 +10,7 @@ Change = Literal[
     "version added",
     "version deleted",
     "version annotated",
+    "version exported",
     "model deleted",
     "alias moved",
     "learning set",

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
 from lipcore.online.record import LEVEL
-from lipcore.vocabulary import CODES, JointType
+from lipcore.vocabulary import CODES, ExportFormat, JointType
 from service.contract.models import VersionNumber
 from service.contract.observations import MAX_SEQUENCE, LearningOptions, State
 from service.contract.payload import LivePayload
@@ -223,6 +223,16 @@ class Snapshot(BaseModel):
     created_at: str
 
 
+class Export(BaseModel):
+    """Last export of a model in one format."""
+
+    format: ExportFormat
+    version: int
+    revision: int
+    at: str
+    outdated: bool = Field(description="Whether another version serves, or this one has learnt since")
+
+
 class LearningStatus(BaseModel):
     """Status of learning."""
 
@@ -252,6 +262,7 @@ class LearningStatus(BaseModel):
         description="Ranges [first, last] of revisions that a rollback can return to; 0 is the version as trained"
     )
     snapshots: list[Snapshot] = Field(description="Revisions with a stored state, newest first")
+    exports: list[Export] = Field([], description="Last export in each format, newest first, from the audit log")
 
 
 class Learning(BaseModel):

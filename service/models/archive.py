@@ -22,6 +22,7 @@ from lipcore.vocabulary import ExportFormat
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
 from service.models import registry
 from service.models.archive_reading import BLOCK, CHECKSUMS, EXPORT, FORMAT, FORMAT_VERSION, padding
+from service.models.exports import note_export
 from service.models.lineage import software
 from service.models.loaded import LoadedModels
 from service.storage.database import VersionRow, now
@@ -63,7 +64,9 @@ def export(
         origin = ModelOrigin(row.model, row.version, revision, persistence.sha256(files[TENSORS]))
         if kind != "archive":
             manifest = json.loads(files[MANIFEST]) if revision else row.manifest
-            return _export_as(kind, loaded, persistence.decode(files), manifest["parameters"], origin)
+            made = _export_as(kind, loaded, persistence.decode(files), manifest["parameters"], origin)
+            note_export(loaded.database, origin, kind)
+            return made
     except ModelFormatError as error:
         registry.find(loaded.database, row.model, row.version)  # raises if the version was deleted meanwhile
         message = f"version {row.version} of model {row.model!r} cannot be exported: {error}"
@@ -82,6 +85,7 @@ def export(
     files = {EXPORT: _json(about), **files}
     sums = _json({name: persistence.sha256(content) for name, content in files.items()})
     file = _packed(loaded, {CHECKSUMS: sums, **files})
+    note_export(loaded.database, origin, kind)
     return ExportedFile(f"{origin.stem}.tar", MEDIA_TYPE, file.tell(), _pieces(file))
 
 

@@ -25,6 +25,7 @@ from service.learning import owner
 from service.learning.ingest.observations import read_state
 from service.learning.learners import Learners
 from service.models import registry, verdicts
+from service.models.exports import list_exports
 from service.models.served import ServedModel
 from service.storage.database import EventRow, StreamRow
 from service.storage.rows import Page
@@ -59,6 +60,7 @@ def read_learning(learners: Learners, model: str) -> schema.Learning:
                 schema.Snapshot(revision=row.number - start, created_at=row.created_at)
                 for row in snapshots.list_snapshots(session, model, version)
             ],
+            exports=list_exports(session, model, version, events - start),
         )
         return schema.Learning(model=model, options=owner.read_options(session, model), status=status)
 

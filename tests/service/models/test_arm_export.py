@@ -68,3 +68,27 @@ def test_version_without_an_arm_is_rejected(api, arm, kind):
     assert "version 1 of model 'urdf-none'" in refusal["message"]
     assert "no rigid bodies" in refusal["message"]
     assert refusal["detail"][0]["field"] == "version"
+
+
+def test_status_names_outdated_exports(api):
+    service = service_of(api)
+    publish_arm(service.database, service.files, "exported-arm")
+    assert api.get("/v1/models/exported-arm/learning").json()["status"]["exports"] == []
+    for kind in ("urdf", "mjcf", "urdf"):
+        assert export(api, "exported-arm", kind).status_code == 200
+
+    def outdated():
+        made = api.get("/v1/models/exported-arm/learning").json()["status"]["exports"]
+        return [(each["format"], each["version"], each["revision"], each["outdated"]) for each in made]
+
+    assert outdated() == [("urdf", 1, 0, False), ("mjcf", 1, 0, False)]
+    q = np.zeros((5, 7)).tolist()
+    batch = {"stream_id": "s", "sequence": 0, "t": [0.0, 0.01, 0.02, 0.03, 0.04], "q": q, "dq": q, "ddq": q, "tau": q}
+    assert api.post("/v1/models/exported-arm/observations", json=batch).status_code == 200
+    assert outdated() == [("urdf", 1, 0, True), ("mjcf", 1, 0, True)]
+    publish_arm(service.database, service.files, "exported-arm")
+    service.loaded.announce(["exported-arm"])
+    assert export(api, "exported-arm", "mjcf").status_code == 200
+    assert outdated() == [("mjcf", 2, 0, False), ("urdf", 1, 0, True)]
+    lines = api.get("/v1/audit", params={"model": "exported-arm", "change": "version exported"}).json()["items"]
+    assert [each["after"]["format"] for each in lines] == ["mjcf", "urdf", "mjcf", "urdf"]

@@ -31,6 +31,7 @@ class AuditEntry(Record, frozen=True, kw_only=True):
         "version added",
         "version deleted",
         "version annotated",
+        "version exported",
         "model deleted",
         "alias moved",
         "learning set",

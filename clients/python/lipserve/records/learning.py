@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+from msgspec import field
+
 from lipserve.records import Record
 from lipserve.records.verdicts import Verdict
 
@@ -138,6 +140,19 @@ class Snapshot(Record, frozen=True, kw_only=True):
     created_at: str
 
 
+class Export(Record, frozen=True, kw_only=True):
+    """Last export of a model in one format.
+
+    outdated: Whether another version serves, or this one has learnt since
+    """
+
+    format: Literal["archive", "urdf", "mjcf", "c"]
+    version: int
+    revision: int
+    at: str
+    outdated: bool
+
+
 class LearningStatus(Record, frozen=True, kw_only=True):
     """Status of learning.
 
@@ -156,6 +171,7 @@ class LearningStatus(Record, frozen=True, kw_only=True):
     candidate: Always null: a refreshed version is compared before it is published
     reachable: Ranges [first, last] of revisions that a rollback can return to; 0 is the version as trained
     snapshots: Revisions with a stored state, newest first
+    exports: Last export in each format, newest first, from the audit log
     """
 
     version: int
@@ -173,6 +189,7 @@ class LearningStatus(Record, frozen=True, kw_only=True):
     streams: list[Stream]
     reachable: list[list[int]]
     snapshots: list[Snapshot]
+    exports: list[Export] = field(default_factory=list)
 
 
 class Learning(Record, frozen=True, kw_only=True):
