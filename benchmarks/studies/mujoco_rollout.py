@@ -2,10 +2,10 @@
 
     python benchmarks/studies/mujoco_rollout.py MODEL_FOLDER RECORDING.npz
 
-A PD controller with gravity compensation moves the arm along the recorded positions and speeds. The recording has t, q,
-dq and tau, joints in the order of the model. The error is the RMS of the difference divided by the RMS of the recorded
-torque, joint by joint; `recorded motion` is the error of `mj_inverse` at the recorded states, `served` that of the
-model.
+A PD controller with gravity compensation moves the arm along the recorded positions. The recording has t, q, dq and
+tau, joints in the order of the model. The error is the RMS of the difference divided by the RMS of the recorded torque,
+joint by joint, from the first SETTLED_S on. `recorded motion` is the error of `mj_inverse` at the recorded states,
+`served` that of the model.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicSpline
 
 import lipcore
 from lipcore.data.samples import Array
@@ -25,6 +25,8 @@ from lipcore.model.parameters import report
 from lipcore.model.torque_model import TorqueModel
 
 STEP_S = 5e-4
+SETTLED_S = 0.2
+"""Time after which the controller has settled."""
 STIFFNESS_RAD_S, DAMPING = 120.0, 1.0
 """Natural frequency and damping ratio of the controller; its gains follow from the arm's inertia."""
 
@@ -40,16 +42,16 @@ def place_joints(arm: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:
     return [int(arm.joint(name).dofadr[0]) for name in names]
 
 
-def follow(mjcf: str, names: tuple[str, ...], t: Array, q: Array, dq: Array) -> Array:
-    """Return the control torque, (N, n), that moves an arm along (N, n) positions and speeds at times (N,)."""
+def follow(mjcf: str, names: tuple[str, ...], t: Array, q: Array) -> Array:
+    """Return the control torque, (N, n), that moves an arm along positions (N, n) at times (N,)."""
     arm = mujoco.MjModel.from_xml_string(mjcf)
     arm.opt.timestep, arm.jnt_limited[:] = STEP_S, 0
     arm.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     data, place = mujoco.MjData(arm), place_joints(arm, names)
-    data.qpos[place], data.qvel[place] = q[0], dq[0]
     steps = np.arange(round((t[-1] - t[0]) / STEP_S) + 1) * STEP_S + t[0]
-    course = CubicHermiteSpline(t, q, dq)  # a line between rows would lose a part of the acceleration
+    course = CubicSpline(t, q)  # with a continuous acceleration
     goal, speed = course(steps), course(steps, 1)
+    data.qpos[place], data.qvel[place] = goal[0], speed[0]
     used, mass = np.empty_like(goal), np.empty((arm.nv, arm.nv))
     for k in range(len(steps)):
         mujoco.mj_forward(arm, data)
@@ -87,13 +89,14 @@ def main() -> None:
     ddq = recording["ddq"] if "ddq" in recording else np.gradient(dq, t, axis=0)
     mjcf, names = exported(model), model.joint_names
     columns = {
-        "followed": follow(mjcf, names, t, q, dq),
+        "followed": follow(mjcf, names, t, q),
         "recorded motion": invert(mjcf, names, np.stack([q, dq, ddq], axis=1)),
         "served": model.predict(q, dq, ddq).tau,
     }
+    settled = t > t[0] + SETTLED_S
     print("| joint | " + " | ".join(columns) + " |\n| " + "--- | " * (1 + len(columns)))
     for joint, name in enumerate(names):
-        errors = (relative_error(values, tau)[joint] for values in columns.values())
+        errors = (relative_error(values[settled], tau[settled])[joint] for values in columns.values())
         print(f"| {name} | " + " | ".join(f"{error:.1%}" for error in errors) + " |")
     distance = np.abs(columns["recorded motion"] - columns["served"]).max(axis=0)
     print("largest distance of the file from the served answer, N·m (N):", *(f"{each:.3g}" for each in distance))

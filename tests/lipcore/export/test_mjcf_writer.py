@@ -172,6 +172,6 @@ def test_arm_that_follows_a_motion_needs_the_recorded_torque() -> None:
     t = np.arange(1001) / 100.0
     q, dq, ddq = sinusoids(robot, simulation, t, np.random.default_rng(7))
     recorded = inverse_dynamics(robot, q, dq, ddq)
-    found = follow(mjcf_text(arm_of(model)), model.joint_names, t, q, dq)
+    found = follow(mjcf_text(arm_of(model)), model.joint_names, t, q)
     error = relative_error(found[20:], recorded[20:])  # the controller settles within 0.2 s
     assert (error < 0.05).all()
