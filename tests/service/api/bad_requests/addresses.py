@@ -31,7 +31,7 @@ WRONG_METHODS = (
     *(("POST", LEARNING), ("PUT", OBSERVE), ("GET", "/v1/echo"), ("DELETE", "/openapi.json")),
 )
 PAGES = (DATASETS, ROBOTS, JOBS, MODELS, OBSERVE, f"{MODELS}/panda-sim/alarms")
-PARTS = ("aliases", "export", "urdf", "alarms", "quality", "live")
+PARTS = ("aliases", "export", "alarms", "quality", "live")
 MISSING = (
     *(("GET", f"{DATASETS}/ds_0", "dataset"), ("DELETE", f"{DATASETS}/ds_0", "dataset")),
     *(("GET", f"{DATASETS}/ds_0/preview", "dataset"), ("GET", f"{ROBOTS}/urdf_0", "robot")),
