@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from benchmarks.real import mujoco_sysid, rivals
+from benchmarks.real import figaroh_fit, mujoco_sysid, rivals
 from benchmarks.real.cells import BASE_FRICTION, PRODUCT, Cache, Cell, Result, evaluate_forecast
 from benchmarks.real.product import Bed, open_bed
 from benchmarks.real.recordings import RECORDINGS, Recording, prepare
@@ -34,9 +34,10 @@ WITH_BODY: Mapping[str, Callable[[RigidBody, Samples, Samples], Forecast]] = {
     "least squares": rivals.predict_least_squares,
     "Bayesian least squares": rivals.predict_bayesian,
     "mujoco.sysid": mujoco_sysid.predict_mujoco,
+    "FIGAROH": figaroh_fit.predict_figaroh,
 }
 """Other methods that know the URDF."""
-OPTIONAL = {"mujoco.sysid": mujoco_sysid.is_installed}
+OPTIONAL = {"mujoco.sysid": mujoco_sysid.is_installed, "FIGAROH": figaroh_fit.is_installed}
 """Methods that may not be installed, and functions that check it."""
 
 Service = Callable[[], Bed]

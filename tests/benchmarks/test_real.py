@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.real import mujoco_sysid, report, rivals, running
+from benchmarks.real import figaroh_fit, mujoco_sysid, report, rivals, running
 from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, evaluate_forecast
 from benchmarks.real.product import open_bed
 from benchmarks.real.recordings import Recording
@@ -95,6 +95,13 @@ def test_the_mujoco_model_has_the_torque_of_the_urdf(name):
 def test_mujoco_finds_the_torque_of_a_simulated_robot():
     train, test = simulated(noise=0.001, samples=100), simulated(seed=2)
     assert nmse(mujoco_sysid.predict_mujoco(PENDULUM.body(train), train, test), test).max() < 1e-2
+
+
+@pytest.mark.skipif(not figaroh_fit.is_installed(), reason="FIGAROH is not installed")
+@pytest.mark.filterwarnings("ignore:to-Python converter:RuntimeWarning")
+def test_figaroh_finds_the_torque_of_a_simulated_robot():
+    train, test = simulated(noise=0.001, samples=100), simulated(seed=2)
+    assert nmse(figaroh_fit.predict_figaroh(PENDULUM.body(train), train, test), test).max() < 1e-2
 
 
 def test_splits_keep_a_guard_between_training_and_test():
