@@ -1,4 +1,4 @@
-"""FIGAROH on the URDF's arm: `pip install figaroh`, version 1.
+"""FIGAROH on the URDF's arm: `pip install figaroh ipython`, version 1.
 
 It is told the URDF and the recording with accelerations. It finds base parameters by QR decomposition: of bodies, rotor
 inertias, viscous and Coulomb friction and offsets, by least squares weighted joint by joint. It offers the standard
@@ -24,7 +24,7 @@ CONFIG = {"has_friction": True, "has_actuator_inertia": True, "has_joint_offset"
 
 def is_installed() -> bool:
     """Return whether FIGAROH and what its identification imports are installed."""
-    return all(find_spec(name) is not None for name in ("figaroh", "numdifftools", "pandas", "yaml"))
+    return all(find_spec(name) is not None for name in ("figaroh", "numdifftools", "pandas", "IPython"))
 
 
 def predict_figaroh(body: RigidBody, train: Samples, test: Samples) -> Forecast:
