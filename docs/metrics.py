@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from service.api import metrics
+from service.journal.webhook import Webhook
 from service.learning import metrics as learning
 from service.telemetry.meters import MetricKind, list_metrics
 from service.training import metrics as training
@@ -21,6 +22,7 @@ KINDS: tuple[MetricKind, ...] = (
     *list_metrics(metrics.Traffic),
     *list_metrics(training.JobMetrics),
     *list_metrics(learning.LearningCollector),
+    *list_metrics(Webhook),
     *list_metrics(metrics.System),
 )
 """All metrics of /metrics except Prometheus's standard metrics of a process."""

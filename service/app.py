@@ -41,6 +41,7 @@ from service.api.routes import (
 from service.api.stream import routes as stream
 from service.foundation.settings import Settings
 from service.foundation.text import counted
+from service.journal.webhook import Webhook
 from service.learning import friction, refresh
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
@@ -79,7 +80,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lock = lock_home(settings.home)
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
         threadpool_limits(SERVING_THREADS)  # of BLAS; the models imported its libraries
-        _share(app, storage, jobs, learners)
+        webhook = Webhook(storage.database, settings)
+        _share(app, storage, jobs, learners, webhook)
         stop_following = storage.database.follow_others(lambda: Replication(learners).close)
         try:
             async with AsyncExitStack() as serving:
@@ -88,11 +90,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 await serving.enter_async_context(clean_hourly(storage.database, settings))
                 if calls:
                     await serving.enter_async_context(_calls(app, settings, stopping))
+                webhook.start()
                 yield
         finally:
             async with AsyncExitStack() as rest:
                 rest.callback(lock.close)
                 rest.callback(storage.database.close)
+                rest.push_async_callback(to_thread.run_sync, webhook.close)
                 rest.push_async_callback(to_thread.run_sync, learners.close)
                 rest.push_async_callback(to_thread.run_sync, stop_following)
                 await to_thread.run_sync(jobs.close)  # first: the learner needs the CPU to store its state
@@ -201,7 +205,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     return storage, jobs, learners
 
 
-def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -> None:
+def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners, webhook: Webhook) -> None:
     """Store the parts in the application's state, where routes read them."""
     state, loaded, settings = app.state, learners.loaded, storage.settings
     probes: dict[str, Probe] = {
@@ -218,5 +222,6 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -
         Traffic(state.meters),
         JobMetrics(storage.database),
         LearningCollector(learners),
+        webhook,
         System(storage, state.readiness),
     )

@@ -11,7 +11,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, SecretStr, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 CHECKOUT_MODELS = Path(__file__).resolve().parents[2] / "models"
@@ -132,6 +132,20 @@ class Settings(BaseSettings):
         description="Send a trace of each request to OTEL_EXPORTER_OTLP_ENDPOINT. Needs `lipserve[opentelemetry]`.",
     )
 
+    alarm_webhook: str | None = Field(
+        None,
+        pattern="^https?://",
+        repr=False,
+        description="URL to which each alarm raised or cleared is posted as JSON, with retries for a day. The service "
+        "connects to any address given here. Needs LIPSERVE_ALARM_WEBHOOK_SECRET.",
+    )
+    alarm_webhook_secret: SecretStr | None = Field(
+        None,
+        min_length=16,
+        description="Secret, at least 16 characters, that signs what is posted to LIPSERVE_ALARM_WEBHOOK. The client's "
+        "`read_alarm_event` checks the signature.",
+    )
+
     max_upload_bytes: Bytes = Field(256 * MiB, description="Max size of an uploaded recording.")
     max_unpacked_bytes: Bytes = Field(1024 * MiB, description="Max size of a recording after unpacking.")
     parser_memory_bytes: Bytes = Field(
@@ -246,6 +260,12 @@ class Settings(BaseSettings):
             raise ValueError("database_url and files_url must be set together, for services that share them")
         if self.cluster is not None and self.database_url is None:
             raise ValueError("cluster needs database_url and files_url, which its workers share")
+        return self
+
+    @model_validator(mode="after")
+    def _webhook_signed(self) -> Self:
+        if self.alarm_webhook is not None and self.alarm_webhook_secret is None:
+            raise ValueError("alarm_webhook needs alarm_webhook_secret, which signs what is posted")
         return self
 
     @model_validator(mode="after")

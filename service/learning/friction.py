@@ -54,7 +54,7 @@ def report_friction(database: Database, published: Publication) -> None:
             for each in _implausible(published, MAX_DEVIATIONS)
         ]
         text = texts.describe_friction(described) if evidence["coefficients"] else texts.describe_plausible_friction()
-        raise_alarm(session, published.model, "friction", text, evidence)
+        raise_alarm(session, published.model, "friction", text, evidence, clears=not evidence["coefficients"])
 
 
 def _implausible(published: Publication, deviations: float) -> list[NegativeFriction]:

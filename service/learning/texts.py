@@ -22,6 +22,11 @@ def describe_change(joints: str, suspect: str, follows: str) -> str:
     return f"The torque of {joints} no longer fits the model (possible cause: {suspect}). {CONSEQUENCES[follows]}"
 
 
+def describe_decision(decision: str) -> str:
+    """Return the end of a pause after a change. decision: `adapt` or `ignore`."""
+    return f"Learning continues. The change is {'learnt' if decision == 'adapt' else 'ignored'}."
+
+
 def describe_departure(joints: str, version: int, follows: str) -> str:
     """Return the alarm of a slow drift from the robot that a version was trained on."""
     return f"The torque of {joints} has slowly drifted from the training of version {version}. {CONSEQUENCES[follows]}"

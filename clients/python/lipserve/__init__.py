@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from lipserve.alarms import AlarmEvent, SignatureError, read_alarm_event
     from lipserve.asynchronous import AsyncClient
     from lipserve.exchange import StreamError
     from lipserve.results.evaluation import Comparison, Evaluation
@@ -28,6 +29,7 @@ __version__ = "0.2.0"
 """Version of the client and of the service: both distributions read it here."""
 
 _HOMES = {
+    "AlarmEvent": "alarms",
     "ApiError": "sending",
     "AsyncClient": "asynchronous",
     "AsyncStreamClient": "stream",
@@ -39,13 +41,16 @@ _HOMES = {
     "Prediction": "results.series",
     "Preview": "results.series",
     "ServiceUnreachableError": "sending",
+    "SignatureError": "alarms",
     "StreamClient": "stream",
     "StreamError": "exchange",
     "Trace": "results.series",
+    "read_alarm_event": "alarms",
 }
 """Module of each exported name. Names are imported on first use: the service imports modules of this package."""
 
 __all__ = [
+    "AlarmEvent",
     "ApiError",
     "AsyncClient",
     "AsyncStreamClient",
@@ -57,10 +62,12 @@ __all__ = [
     "Prediction",
     "Preview",
     "ServiceUnreachableError",
+    "SignatureError",
     "StreamClient",
     "StreamError",
     "Trace",
     "__version__",
+    "read_alarm_event",
 ]
 
 

@@ -19,8 +19,9 @@ from service.contract import learning as schema
 from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, invalid_request, not_found, problem
 from service.journal import log, undo
+from service.journal.alarms import add_event
 from service.journal.alarms import page as alarms_page
-from service.learning import owner
+from service.learning import owner, texts
 from service.learning.control import status
 from service.learning.ingest.observations import read_state
 from service.learning.learners import Learners
@@ -209,6 +210,7 @@ def decide(learners: Learners, model: str, request: schema.ChangeRequest) -> sch
                 owner.resume(session, model)
                 decided = {"decision": request.decision, "rows": rows}
                 audit.note(session, model, "change decided", version, before=held, after=decided)
+                add_event(session, "alarm.cleared", model, "change", texts.describe_decision(request.decision), decided)
             else:
                 done = pending[-1].number
             revised = read_revision(session, model, version)

@@ -173,7 +173,7 @@ class Weighing:
                     monitor.payload_alarm_at = message.received
                     text, mass = _describe_watch(stream_id, watch)
                     evidence = {"stream_id": stream_id, "at": watch.since, **mass}
-                    raise_alarm(session, model, "payload", text, evidence)
+                    raise_alarm(session, model, "payload", text, evidence, clears=watch.held is None)
             monitor.number = event.number
             monitor.streams.change(stream_id, scale=None)  # errors during the change do not calibrate its intervals
             served.scales.replace(monitor.streams.factors(served.version))

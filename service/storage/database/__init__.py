@@ -2,6 +2,7 @@
 
 from service.storage.database.engine import Database, fetch
 from service.storage.database.tables import (
+    AlarmEventRow,
     AlarmRow,
     AliasMoveRow,
     AliasRow,
@@ -25,6 +26,7 @@ from service.storage.database.tables import (
 )
 
 __all__ = [
+    "AlarmEventRow",
     "AlarmRow",
     "AliasMoveRow",
     "AliasRow",

@@ -322,6 +322,21 @@ class AlarmRow(Base):
     evidence: Mapped[dict[str, Any]]
 
 
+class AlarmEventRow(Base):
+    """An alarm raised or cleared that the webhook of the operator has not acknowledged yet."""
+
+    __tablename__ = "alarm_events"
+
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    at: Mapped[float]
+    """Unix time, s."""
+    body: Mapped[dict[str, Any]]
+    """The JSON that is sent."""
+    attempts: Mapped[int] = mapped_column(default=0)
+    due: Mapped[float] = mapped_column(index=True)
+    """Unix time of the next attempt, s."""
+
+
 class ApiKeyRow(Base):
     """An API key with its scopes and expiry. The key itself is not stored."""
 

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 from fastapi.testclient import TestClient
+from sqlalchemy import select
 
 import lipcore
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.models import registry
-from service.storage.database import Database
+from service.storage.database import AlarmEventRow, Database
 from service.storage.files import Files, new_id
 from tests.service.data import ADDRESS, ServiceParts, error, eventually, service_of, stream
 
@@ -117,6 +118,12 @@ class LearningModel:
                 event: Any = log.find_batch(session, self.name, stream_id, sequence)
                 snapshots._note_forgotten(session, event)
                 session.delete(event)
+
+    def list_alarm_events(self) -> list[tuple[str, str]]:
+        """Return type and kind of the events that wait for a webhook."""
+        with service_of(self.client).database.session() as session:
+            bodies = [row.body for row in session.scalars(select(AlarmEventRow).order_by(AlarmEventRow.seq))]
+        return [(body["type"], body["kind"]) for body in bodies if body["model"] == self.name]
 
     def last_audit_entry(self) -> dict[str, Any]:
         """Return the newest entry of the model in the audit log."""

@@ -108,6 +108,7 @@ def test_rejected_and_rolled_back_rows_leave_predictions_bitwise_unchanged(learn
     assert changed["held"]
     assert predict_at(changed["revision"]) == before
     learning_model.post("learning/change", {"decision": "ignore"})
+    assert learning_model.list_alarm_events() == [("alarm.raised", "change"), ("alarm.cleared", "change")]
     assert predict_at(changed["revision"]) == before
     options = learning_model.get("learning")["options"]
     learning_model.put("learning", {**options, "enabled": False})

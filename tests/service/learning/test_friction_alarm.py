@@ -69,7 +69,7 @@ def report(learning_service, learning_model):
     return report
 
 
-def test_alarm_is_raised_once_and_ends_once(report):
+def test_alarm_is_raised_once_and_ends_once(report, learning_model):
     assert report(1, -0.19, 0.2) == []
     [alarm] = report(2, -0.25, 0.2)
     assert "(Coulomb −0.25 ± 0.1 N·m)" in alarm
@@ -81,6 +81,8 @@ def test_alarm_is_raised_once_and_ends_once(report):
     assert report(6, 0.2, 0.2) == [END, *two]
     assert report(7, 0.2, 0.2) == [END, *two]
     assert len(report(8, -0.3, 0.2)) == 4
+    types = ["alarm.raised", "alarm.raised", "alarm.cleared", "alarm.raised"]
+    assert learning_model.list_alarm_events() == [(each, "friction") for each in types]
 
 
 def test_version_that_does_not_serve_raises_no_alarm(report):
