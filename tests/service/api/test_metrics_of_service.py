@@ -9,12 +9,15 @@ from docs import metrics as table
 from service.storage.database import JobRow
 from service.training.metrics import JobMetrics
 from tests import ROOT
+from tests.docs.test_monitoring import EXPRESSIONS, METRIC
 from tests.service.api.test_requests import QUERY
 from tests.service.data import QUICK, queue, service_of, stream, upload
 
 DOCUMENT = ROOT / "docs/reference/metrics.md"
 FAST_OPTIONS = {**QUICK, "posterior_samples": 40}
 """Options of a fit within the limits of the strict service."""
+PARTS = ("_bucket", "_count")
+"""Ends of the series of a histogram."""
 PREDICT = "/v1/models/{model}/predict"
 
 
@@ -48,6 +51,13 @@ def test_documented_metrics_are_the_exported_ones(api):
             assert set(sample.labels) - {"le"} == set(kind.labels)
     answer = api.get("/metrics", headers={"accept": "application/openmetrics-text; version=1.0.0"})
     assert set(documented) <= {each.name for each in parse_open(answer.text)}
+
+
+def test_dashboard_and_alerts_query_exported_metrics(api):
+    shown = {f"{family.name}{end}" for family in parse(api.get("/metrics").text) for end in ("", "_total", *PARTS)}
+    queried = {name for each in EXPRESSIONS for name, _ in METRIC.findall(each)}
+    assert "process_cpu_seconds_total" in queried
+    assert queried <= shown
 
 
 def test_requests_are_counted_by_route_and_model(api):
