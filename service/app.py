@@ -22,9 +22,10 @@ from service.api.dashboard import routes as dashboard
 from service.api.guide import routes as guide
 from service.api.limits.requests import MAX_REQUESTS, PATIENCE, BodyLimit, Gate, RateLimit, Turns, body_limits
 from service.api.metrics import System, Traffic
+from service.api.oip import extension_routes, rpc
 from service.api.oip import routes as oip
-from service.api.oip import rpc
 from service.api.oip.sequences import Sequences
+from service.api.oip.statistics import Statistics
 from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
 from service.api.routes import (
     audit,
@@ -133,6 +134,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         learning.router,
         learning.overview_router,
         live.router,
+        extension_routes.router,  # before /v2/models/{model}
         oip.router,
         stream.router(),
     ):
@@ -215,7 +217,7 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners, w
         "training": lambda lasting: check_queue(jobs, lasting),
     }
     state.storage, state.loaded, state.jobs, state.learners = storage, loaded, jobs, learners
-    state.sequences = Sequences()
+    state.sequences, state.statistics = Sequences(), Statistics()
     state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))
     state.readiness = Readiness(probes, state.stopping)
     state.collectors = (

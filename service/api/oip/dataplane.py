@@ -13,6 +13,7 @@ from service.api.limits.requests import in_turn
 from service.api.oip import query, schema
 from service.api.oip.query import shapes
 from service.api.oip.sequences import Sequences
+from service.api.oip.statistics import Statistics, Timing
 from service.api.oip.tensors import Message
 from service.api.route import Reply
 from service.contract.models import ALIAS
@@ -48,6 +49,7 @@ async def ready(loaded: LoadedModels, turns: CapacityLimiter, name: str, version
 async def infer(
     loaded: LoadedModels,
     sequences: Sequences,
+    statistics: Statistics,
     turns: CapacityLimiter,
     name: str,
     version: str | None,
@@ -60,13 +62,23 @@ async def infer(
     """
     settings, arrived = loaded.storage.settings, perf_counter()
     served = await find(loaded, turns, name, version)
-    if size > MAX_INLINE_BYTES:
-        return await in_turn(turns, query.infer, served, decode, settings, sequences, arrived)
-    message = decode()
-    task = query.read_task(served, message, settings, sequences, arrived)
-    if task.is_inline:
-        return query.respond(served, message, task)
-    return await in_turn(turns, query.respond, served, message, task)
+    timing = Timing()
+    try:
+        if size > MAX_INLINE_BYTES:
+            reply = await in_turn(turns, query.infer, served, decode, settings, sequences, arrived, timing)
+        else:
+            message = decode()
+            task = query.read_task(served, message, settings, sequences, arrived)
+            timing.note_read(task.query.values.shape[1])
+            if task.is_inline:
+                reply = query.respond(served, message, task)
+            else:
+                reply = await in_turn(turns, query.respond, served, message, task, timing)
+    except Exception:
+        statistics.fail(served.name, served.version, timing)
+        raise
+    statistics.succeed(served.name, served.version, timing)
+    return reply
 
 
 def metadata(loaded: LoadedModels, served: ServedModel) -> schema.ModelMetadata:

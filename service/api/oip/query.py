@@ -13,6 +13,7 @@ from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePredicti
 from lipcore.vocabulary import COMPONENTS, ComponentName, offered_components
 from service.api.oip import schema
 from service.api.oip.sequences import Sequences, read_part
+from service.api.oip.statistics import Timing
 from service.api.oip.tensors import Answer, Header, Message
 from service.api.route import Reply
 from service.foundation.errors import invalid_request
@@ -246,14 +247,22 @@ def _torques(model: TorqueModel, motion: Array, deflections: Array | None, names
 
 
 def infer(
-    served: ServedModel, decode: Callable[[], Message], settings: Settings, sequences: Sequences, arrived: float
+    served: ServedModel,
+    decode: Callable[[], Message],
+    settings: Settings,
+    sequences: Sequences,
+    arrived: float,
+    timing: Timing,
 ) -> Reply:
     """Decode a request and answer it. Blocking: use it in a thread.
 
     Raise what `decode` raises, or InvalidRequestError.
     """
+    timing.start()
     message = decode()
-    return respond(served, message, read_task(served, message, settings, sequences, arrived))
+    task = read_task(served, message, settings, sequences, arrived)
+    timing.note_read(task.query.values.shape[1])
+    return respond(served, message, task)
 
 
 def read_task(
@@ -276,8 +285,10 @@ def read_task(
     return task._replace(deflections=sequences.follow(served, part, arrived, task.query.values[:2]))
 
 
-def respond(served: ServedModel, message: Message, task: InferTask) -> Reply:
-    """Compute and encode the answer; raise InvalidRequestError."""
+def respond(served: ServedModel, message: Message, task: InferTask, timing: Timing | None = None) -> Reply:
+    """Compute and encode the answer; raise InvalidRequestError. timing: of an answer that has waited for a thread."""
+    if timing is not None:
+        timing.start()
     values_of = compute(served, task)
     answers: list[Answer] = []
     for name, binary in task.outputs.items():

@@ -98,7 +98,14 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
     state, where = scope["app"].state, scope["path_params"]
     decode = partial(wire.decode, body, scope["headers"])
     return await dataplane.infer(
-        state.loaded, state.sequences, state.turns.predictions, where["model"], where.get("version"), len(body), decode
+        state.loaded,
+        state.sequences,
+        state.statistics,
+        state.turns.predictions,
+        where["model"],
+        where.get("version"),
+        len(body),
+        decode,
     )
 
 

@@ -14,7 +14,7 @@ TORQUE = "tau"
 DATATYPES = ("FP64", "FP32")
 HEADER = "Inference-Header-Content-Length"
 BINARY = "binary_tensor_data"
-EXTENSIONS = [BINARY, "sequence", "sequence(string_id)"]
+EXTENSIONS = [BINARY, "sequence", "sequence(string_id)", "model_repository", "model_configuration", "statistics"]
 """Supported extensions in the server's metadata."""
 SEQUENCE_ID_CHARACTERS = 128
 SEQUENCE_ID = f"a whole number from 1 to {2**64 - 1}, or a string of 1 to {SEQUENCE_ID_CHARACTERS} characters"

@@ -75,6 +75,70 @@ message ModelInferResponse.InferOutputTensor
   repeated int64 shape = 3
   parameters = 4
   InferTensorContents contents = 5
+message RepositoryIndexRequest
+  string repository_name = 1
+  bool ready = 2
+message RepositoryIndexResponse
+  repeated RepositoryIndexResponse.ModelIndex models = 1
+message RepositoryIndexResponse.ModelIndex
+  string name = 1
+  string version = 2
+  string state = 3
+  string reason = 4
+message RepositoryModelLoadRequest
+  string repository_name = 1
+  string model_name = 2
+message RepositoryModelUnloadRequest
+  string repository_name = 1
+  string model_name = 2
+message ModelConfigRequest
+  string name = 1
+  string version = 2
+message ModelConfigResponse
+  ModelConfig config = 1
+message ModelConfig
+  string name = 1
+  string platform = 2
+  string backend = 17
+  int32 max_batch_size = 4
+  repeated ModelInput input = 5
+  repeated ModelOutput output = 6
+  ModelTransactionPolicy model_transaction_policy = 19
+message ModelInput
+  string name = 1
+  int32 data_type = 2
+  repeated int64 dims = 4
+  bool optional = 8
+message ModelOutput
+  string name = 1
+  int32 data_type = 2
+  repeated int64 dims = 3
+message ModelTransactionPolicy
+  bool decoupled = 1
+message ModelStatisticsRequest
+  string name = 1
+  string version = 2
+message ModelStatisticsResponse
+  repeated ModelStatistics model_stats = 1
+message ModelStatistics
+  string name = 1
+  string version = 2
+  uint64 last_inference = 3
+  uint64 inference_count = 4
+  uint64 execution_count = 5
+  InferStatistics inference_stats = 6
+message InferStatistics
+  StatisticDuration success = 1
+  StatisticDuration fail = 2
+  StatisticDuration queue = 3
+  StatisticDuration compute_input = 4
+  StatisticDuration compute_infer = 5
+  StatisticDuration compute_output = 6
+  StatisticDuration cache_hit = 7
+  StatisticDuration cache_miss = 8
+message StatisticDuration
+  uint64 count = 1
+  uint64 ns = 2
 message InferParameter
   one bool bool_param = 1
   one int64 int64_param = 2
@@ -91,7 +155,10 @@ message InferTensorContents
   repeated double fp64_contents = 7
   repeated bytes bytes_contents = 8
 """
-"""The definition. `parameters` stands for a `map<string, InferParameter>`, `one` for `oneof parameter_choice`."""
+"""The definition. `parameters` stands for a `map<string, InferParameter>`, `one` for `oneof parameter_choice`.
+
+Messages of Triton's extensions have only the fields that are read or written; `data_type` is an enumeration there.
+"""
 _FIELD = re.compile(r"  (?:(?P<label>repeated|one) )?(?:(?P<type>[\w.]+) )?(?P<name>\w+) = (?P<number>\d+)")
 _SCALARS = ("bool", "int32", "int64", "uint32", "uint64", "float", "double", "string", "bytes")
 

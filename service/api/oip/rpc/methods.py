@@ -10,13 +10,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from anyio import to_thread
+from google.protobuf.json_format import ParseDict
 from starlette.datastructures import State
 from starlette.routing import BaseRoute, Match
 from starlette.types import Receive, Scope, Send
 
 from service import __version__
 from service.api.access.scopes import PREDICT, READ, Rule
-from service.api.oip import dataplane, schema
+from service.api.oip import dataplane, extensions, schema
 from service.api.oip.rpc.definition import SERVICE, message
 from service.api.oip.rpc.messages import InferRequest, Message, decode, encode
 from service.api.route import Reply
@@ -26,6 +27,8 @@ from service.foundation.errors import NotReadyError, invalid_request
 CALL = "lipserve.call"
 """Key that marks the ASGI scope of a gRPC call. HTTP requests do not have it."""
 
+_TYPE_FP64 = 12
+"""Number of TYPE_FP64 in the published definition."""
 Answerer = Callable[[State, Scope, bytes], Awaitable[Reply]]
 
 
@@ -105,8 +108,46 @@ async def _model_infer(state: State, scope: Scope, body: bytes) -> Reply:
     sent = decode(InferRequest, body)
     name, version = _model(scope, sent, "model_name", "model_version")
     return await dataplane.infer(
-        state.loaded, state.sequences, state.turns.predictions, name, version, len(body), partial(Message, sent)
+        state.loaded,
+        state.sequences,
+        state.statistics,
+        state.turns.predictions,
+        name,
+        version,
+        len(body),
+        partial(Message, sent),
     )
+
+
+def _document(name: str, document: dict[str, Any]) -> Reply:
+    """Return the reply with a message of these fields; others are left out."""
+    return encode(ParseDict(document, message(name)(), ignore_unknown_fields=True))
+
+
+async def _repository_index(state: State, scope: Scope, body: bytes) -> Reply:
+    ready = decode(message("RepositoryIndexRequest"), body).ready
+    models = await to_thread.run_sync(extensions.index, state.loaded, ready)
+    return _document("RepositoryIndexResponse", {"models": models})
+
+
+async def _model_load(state: State, scope: Scope, body: bytes) -> Reply:
+    raise extensions.refuse_loading(decode(message("RepositoryModelLoadRequest"), body).model_name)
+
+
+async def _model_config(state: State, scope: Scope, body: bytes) -> Reply:
+    name, version = _model(scope, decode(message("ModelConfigRequest"), body), "name", "version")
+    served = await dataplane.find(state.loaded, state.turns.predictions, name, version)
+    return _document("ModelConfigResponse", {"config": extensions.config(served, _TYPE_FP64)})
+
+
+async def _model_statistics(state: State, scope: Scope, body: bytes) -> Reply:
+    sent = decode(message("ModelStatisticsRequest"), body)
+    if sent.version:
+        served = await dataplane.find(state.loaded, state.turns.predictions, *_model(scope, sent, "name", "version"))
+        found = [state.statistics.show(served.name, served.version)]
+    else:
+        found = await to_thread.run_sync(extensions.statistics, state.statistics, state.loaded, sent.name or None)
+    return _document("ModelStatisticsResponse", {"model_stats": found})
 
 
 def _model(scope: Scope, sent: Any, name: str, version: str) -> tuple[str, str | None]:
@@ -127,5 +168,10 @@ METHODS = {
         ("ModelReady", _model_ready, READ),
         ("ModelMetadata", _model_metadata, READ),
         ("ModelInfer", _model_infer, PREDICT),
+        ("RepositoryIndex", _repository_index, READ),
+        ("RepositoryModelLoad", _model_load, READ),
+        ("RepositoryModelUnload", _model_load, READ),
+        ("ModelConfig", _model_config, READ),
+        ("ModelStatistics", _model_statistics, READ),
     )
 }

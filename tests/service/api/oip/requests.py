@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 
 HEADER = "Inference-Header-Content-Length"
-EXTENSIONS = ["binary_tensor_data", "sequence", "sequence(string_id)"]
+EXTENSIONS = [
+    "binary_tensor_data",
+    "sequence",
+    "sequence(string_id)",
+    "model_repository",
+    "model_configuration",
+    "statistics",
+]
 LETTERS = {"FP64": "d", "FP32": "f"}
 
 

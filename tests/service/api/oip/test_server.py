@@ -61,6 +61,18 @@ def test_client_gets_the_requested_outputs(server, client, motion):
         assert_array_equal(result.as_numpy(name), values, err_msg=name)
 
 
+def test_client_reads_index_config_and_statistics(server, client):
+    index = [{"name": "panda-sim", "version": "1", "state": "READY", "reason": ""}]
+    assert client.get_model_repository_index() == index
+    assert client.get_model_config("panda-sim", "1")["max_batch_size"] == 0
+    (before,) = client.get_inference_statistics()["model_stats"]
+    client.infer("panda-sim", inputs(BATCH))
+    (after,) = client.get_inference_statistics("panda-sim", "1")["model_stats"]
+    assert after["inference_count"] - before["inference_count"] == len(BATCH["q"])
+    with pytest.raises(InferenceServerException, match=r"\[400\] Models are not loaded or unloaded by request"):
+        client.load_model("panda-sim")
+
+
 def test_client_reads_errors(client):
     with pytest.raises(InferenceServerException, match=r"\[404\] No model is named 'nobody'"):
         client.infer("nobody", inputs(MOTION))
