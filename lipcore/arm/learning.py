@@ -29,8 +29,11 @@ from lipcore.kernels.drive.terms import passing_row
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.fast.play import POSITIONS
 from lipcore.kernels.geometry import Geometry
+from lipcore.model.selection import MAX_TEXT_LENGTH
+from lipcore.model.texts import list_joints
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.selection import spread_out
+from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import GeometryMode
 
 
@@ -132,6 +135,7 @@ def learn(
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
         report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
+        report |= _fixed_joints(task.robot)
         if result is not None:
             report |= _search_report(result, ends, found)
         report |= {
@@ -313,6 +317,12 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
     stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)
     return bool(np.any(np.sqrt(np.mean((means[0] - means[1]) ** 2, axis=0)) > OPTIONS.min_difference * stated))
+
+
+def _fixed_joints(robot: RigidBody | None) -> dict[str, str]:
+    """Return the report on joints of the URDF that the data lack, such as those of a gripper."""
+    fixed = () if robot is None else robot.fixed_joints
+    return {"fixed_joints": list_joints(fixed)[:MAX_TEXT_LENGTH]} if fixed else {}
 
 
 def _search_report(

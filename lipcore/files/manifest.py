@@ -24,7 +24,7 @@ from lipcore.files.entries import (
     one_of,
 )
 from lipcore.files.strict_json import StrictJsonError, check_texts, quote
-from lipcore.model.selection import Candidate, Count, HeldOut, Name, Selection
+from lipcore.model.selection import Candidate, Count, HeldOut, Name, Selection, Sentence
 from lipcore.posterior.conformal import Conformal
 from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, TORQUE_CONVENTIONS
 
@@ -90,6 +90,7 @@ class Fit(TypedDict, total=False):
     """(N·m)²"""
     seconds: NonNegative
     device: Annotated[str, Meta(pattern=r"^[a-z]{1,10}(:\d{1,3})?$")]
+    fixed_joints: Sentence
     geometry: Annotated[str, one_of(GEOMETRY_MODES)]
     friction_terms: Count
     stribeck_nats: float

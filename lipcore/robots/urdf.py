@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -55,6 +56,8 @@ class RigidBody:
     """How the joints were matched."""
     model: Any = field(repr=False, compare=False)
     """Pinocchio's model, with every other joint locked at neutral."""
+    fixed_joints: tuple[str, ...] = ()
+    """The URDF's joints that move, but are locked because the data lack them."""
 
     @classmethod
     def from_urdf(
@@ -118,7 +121,8 @@ class RigidBody:
                 )
         _check_mimicry(everything, urdf_joints)
         model = _reduce(_parse(text.plain), urdf_joints)
-        return cls(robot, urdf, names, types, urdf_joints, matched, model)
+        fixed = tuple(joint for joint in movable if joint not in chosen)
+        return cls(robot, urdf, names, types, urdf_joints, matched, model, fixed)
 
     @property
     def n_joints(self) -> int:
@@ -166,10 +170,14 @@ def _mismatch(robot: str, movable: Sequence[str], data: Sequence[str], listed: s
 def _check_mimicry(joints: Sequence[UrdfJoint], free: Sequence[str]) -> None:
     for joint in joints:
         if joint.mimics is not None and joint.name in free:
-            raise UrdfError(f"joint {joint.name!r} mimics {joint.mimics!r}: it does not move on its own")
+            raise UrdfError(
+                f"joint {joint.name!r} mimics {joint.mimics!r}: it does not move on its own. Leave it out of the data "
+                "(`drop_joints` of an upload)"
+            )
         if joint.mimics is not None and joint.mimics in free:
             raise UrdfError(
-                f"joint {joint.name!r} mimics {joint.mimics!r} of the data: a coupled joint cannot be locked"
+                f"joint {joint.name!r} mimics {joint.mimics!r} of the data: a coupled joint cannot be locked. Without "
+                f"{joint.mimics!r} in the data (`drop_joints` of an upload), both are fixed at zero"
             )
 
 
@@ -202,11 +210,23 @@ def _reduce(full: Any, free: Sequence[str]) -> Any:
         raise UrdfError(
             f"locking left the joints {', '.join(names[1:])}, expected {', '.join(free)}. A name may be used twice"
         )
-    for index in range(1, model.njoints):
-        parent = model.parents[index]
-        if parent != index - 1:
-            raise UrdfError(
-                f"the joints branch: {names[index]!r} follows {names[parent] if parent else 'the base'!r}, not "
-                f"{names[index - 1]!r}; expected one serial chain from base to tip"
-            )
+    _check_chain(names[1:], [int(parent) - 1 for parent in tuple(model.parents)[1:]])
     return model
+
+
+def _check_chain(names: Sequence[str], parents: Sequence[int]) -> None:
+    """Raise UrdfError unless each joint follows the one before it. parents: index of the joint before, -1: the base."""
+    branches = [index for index, parent in enumerate(parents) if parent != index - 1]
+    if not branches:
+        return
+    first = branches[0]
+    before = "the base" if parents[first] < 0 else repr(names[parents[first]])
+    message = f"the joints branch: {names[first]!r} follows {before}, not {names[first - 1]!r}"
+    if any(parents[index] >= 0 for index in branches):
+        raise UrdfError(f"{message}; expected one serial chain from base to tip")
+    ends = (0, *branches, len(names))
+    arms = [", ".join(names[start:end]) for start, end in pairwise(ends)]
+    raise UrdfError(
+        f"{message}. These {len(arms)} arms share only the fixed base: the torque of each depends on its own motion "
+        f"alone. Train a model for each, from data with its joints only (`joints` of an upload): {'; '.join(arms)}"
+    )

@@ -212,7 +212,7 @@ class _Reader:
             if each.span > checks.CHECKS.max_dropped_span:
                 out.append(
                     f"{WARNING}{name} is left out although it moved by {each.span:.3g}. This affects the torques of "
-                    "the other joints."
+                    "the other joints, unless it is of another arm on the same fixed base."
                 )
             else:
                 out.append(f"{name} is left out and did not move")

@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore import Samples, TorqueModel, train
+from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.arm import mounting
 from lipcore.arm.mounting import POSITIONS, UPRIGHT, turn_joints
 from lipcore.data.motion import Array
 from lipcore.kernels.geometry import rotation_of, rotation_to_axis
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
+from lipcore.robots.library import ROBOTS, load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.choosing import slow
@@ -99,3 +100,14 @@ def test_positions_of_the_base_point_the_named_axis_up() -> None:
             sign, axis = name.removeprefix("on a wall, ")[0], name.removeprefix("on a wall, ")[:2]
             np.testing.assert_allclose(turned[:, up[axis]], [0, 0, 1.0 if sign == "+" else -1.0], atol=1e-12)
     assert mounting.mount(GEOMETRY, UPRIGHT).constants == pytest.approx(GEOMETRY.constants)
+
+
+def test_fit_names_joints_that_the_data_lack(tmp_path) -> None:
+    robot = RigidBody.from_profile("panda", ROBOTS["panda"].free, ("revolute",) * 7)
+    samples = simulate(load_robot("panda"), Simulation(200, 20.0, noise=0.02), 0)
+    model = train(samples, robot.joint_types, "rigid-body", FitOptions(geometry="fixed"), robot=robot)
+    save(model, tmp_path / "model")
+    loaded = load(tmp_path / "model")
+    assert loaded.fit["fixed_joints"] == "panda_finger_joint1, panda_finger_joint2"
+    assert loaded.robot is not None
+    assert loaded.robot.fixed_joints == robot.fixed_joints

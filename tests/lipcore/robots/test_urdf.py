@@ -169,10 +169,42 @@ def test_uploaded_text_is_never_written_to_stderr(capfd: pytest.CaptureFixture[s
 
 def test_branching_joints_are_rejected() -> None:
     text = robot(*AB, link("c"), joint("left", "a", "b"), joint("right", "a", "c"))
-    message = "the joints branch: 'right' follows 'the base', not 'left'; expected one serial"
+    message = r"'right' follows the base, not 'left'.*Train a model for each, .*: left; right$"
     with pytest.raises(UrdfError, match=message):
         RigidBody.from_urdf(text, ("left", "right"), TWO_REVOLUTE)
-    assert RigidBody.from_urdf(text, ("left",), ("revolute",)).n_joints == 1
+    one = RigidBody.from_urdf(text, ("left",), ("revolute",))
+    assert (one.n_joints, one.fixed_joints) == (1, ("right",))
+    torso = robot(*map(link, "abcd"), joint("lift", "a", "b"), joint("left", "b", "c"), joint("right", "b", "d"))
+    with pytest.raises(UrdfError, match=r"'right' follows 'lift', not 'left'; expected one serial chain"):
+        RigidBody.from_urdf(torso, ("lift", "left", "right"), ("revolute",) * 3)
+
+
+def test_two_arms_on_a_fixed_base_are_two_robots() -> None:
+    """What the error about branching joints recommends is exact: the arms do not affect each other."""
+    urdf, free = profile_urdf("baxter-left"), {side: ROBOTS[f"baxter-{side}"].free for side in ("left", "right")}
+    with pytest.raises(UrdfError, match=f"{', '.join(free['left'])}; {', '.join(free['right'])}$"):
+        RigidBody.from_urdf(urdf, (*free["left"], *free["right"]), ("revolute",) * 14)
+    full = pin.buildModelFromXML(urdf)
+    rng = np.random.default_rng(0)
+    q, (dq, ddq) = pin.neutral(full), np.zeros((2, full.nv))
+    for names in free.values():
+        for name in names:
+            place = full.joints[full.getJointId(name)]
+            q[place.idx_q], dq[place.idx_v], ddq[place.idx_v] = rng.normal(size=3)
+    tau = pin.rnea(full, full.createData(), q, dq, ddq)
+    for names in free.values():
+        alone = RigidBody.from_urdf(urdf, names, ("revolute",) * 7)
+        places = [full.joints[full.getJointId(name)] for name in names]
+        at = [place.idx_v for place in places]
+        own = pin.rnea(alone.model, alone.model.createData(), q[[place.idx_q for place in places]], dq[at], ddq[at])
+        assert alone.order == tuple(range(7))
+        np.testing.assert_allclose(own, tau[at], rtol=0, atol=1e-9)
+
+
+def test_joints_without_data_are_fixed_and_named() -> None:
+    panda = RigidBody.from_profile("panda", ROBOTS["panda"].free, ("revolute",) * 7)
+    assert panda.fixed_joints == ("panda_finger_joint1", "panda_finger_joint2")
+    assert RigidBody.from_urdf(ARM, ("j1", "j2"), TWO_REVOLUTE).fixed_joints == ()
 
 
 def test_coupled_joints_are_rejected() -> None:
@@ -184,7 +216,7 @@ def test_coupled_joints_are_rejected() -> None:
     )
     with pytest.raises(UrdfError, match="joint 'j2' mimics 'j1'"):
         RigidBody.from_urdf(text, ("j1", "j2", "j3"), ("revolute",) * 3)
-    with pytest.raises(UrdfError, match="mimics 'j1' of the data: a coupled joint cannot be locked"):
+    with pytest.raises(UrdfError, match=r"mimics 'j1' of the data: a coupled joint cannot be locked\. Without 'j1'"):
         RigidBody.from_urdf(text, ("j1",), ("revolute",))
     assert RigidBody.from_urdf(text, ("j3",), ("revolute",)).n_joints == 1
     assert describe(text).joint_names == ("j1", "j3")
