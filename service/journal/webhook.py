@@ -73,6 +73,7 @@ class Webhook(Collector):
     def start(self) -> None:
         """Start to send, in a thread."""
         if self._url is not None:
+            logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs each request with its URL, often a secret
             self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
             self._thread.start()
 
