@@ -39,6 +39,7 @@ from lipcore.kernels.fast.drive import HARMONICS
 from lipcore.kernels.fast.play import CERTAIN_SHARE
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
+from lipcore.model import dynamics
 from lipcore.model.body import Body
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compact import CompactPosterior
@@ -106,6 +107,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
     limits = [[model.training_range[name][end] for end in ("min", "max")] for name in ("q", "dq", "ddq")]
     body = PAYLOAD.inertia
     assert body is not None
+    vectors = _vectors(model, learnt)
     misfit, elements = posterior.misfit.packed(), learnt.friction.drive.elements
     return {
         "n": str(n),
@@ -146,7 +148,8 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "floor": _braced(posterior.floor),
         "range": _braced(np.array(limits)),
         "payload": "{" + f"{PAYLOAD.mass!r}, {_braced(PAYLOAD.com)}, {_braced(body.reshape(-1))}" + "}",
-        "vector": _braced(_vectors(model, learnt)),
+        "vector": _braced(vectors),
+        "part": _braced(_parts(model, vectors[: VECTORS // 2]).reshape(VECTORS // 2, -1)),
         "noise": _braced(model.noise_std),
         "scale": _braced(model.scale),
     }
@@ -271,6 +274,21 @@ def _vectors(model: TorqueModel, learnt: LinearWeights) -> Array:
         if carried:
             more = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).features(Motion(q, dq, ddq)) @ PAYLOAD.parameters
         out[rows] = np.stack([*motion, mean + more, std], axis=1)
+    return out
+
+
+def _parts(model: TorqueModel, vectors: Array) -> Array:
+    """Return gravity, Coriolis, friction and inertia matrix at vectors without payload, (V, 3 + n, n)."""
+    q, dq, ddq = vectors[:, :3].transpose(1, 0, 2)
+    out, widths = np.empty((len(q), 3 + model.n_joints, model.n_joints)), element_widths(model.joint_types)
+    rest = dynamics.components(model, Motion(q, 0 * q, 0 * q), ["gravity", "inertia_matrix"])
+    out[:, 0], out[:, 3:] = rest["gravity"].mean, rest["inertia_matrix"].mean
+    out[:, 1] = dynamics.components(model, Motion(q, dq, ddq), ["coriolis"])["coriolis"].mean
+    for known in (False, True):
+        rows = slice(int(known), None, 2)
+        before = _deflections_after_trail(q[rows], widths) if known else None
+        motion = Motion(q[rows], dq[rows], ddq[rows], before)
+        out[rows, 2] = dynamics.components(model, motion, ["friction"])["friction"].mean
     return out
 
 
