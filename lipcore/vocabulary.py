@@ -25,6 +25,7 @@ ComponentName = Literal[
     "gravity",
     "inertial",
     "friction",
+    "without_gravity",
     "kinetic_energy",
     "potential_energy",
     "forward_dynamics",

@@ -130,9 +130,9 @@ class TorqueLoop {
   Joints model_torque(const Desired& desired, double step) {
     Joints tau, std, part;
     const double* q = desired.q.data();
-    lipserve_torque_state(q, desired.dq.data(), desired.ddq.data(), payload_, &state_, tau.data(), std.data());
-    lipserve_gravity_payload(q, payload_, part.data());  // the command contains it, if at all, at the measured q
-    for (std::size_t j = 0; j < kJoints; ++j) tau[j] -= part[j];
+    // the command contains gravity, if at all, at the measured position
+    lipserve_torque_without_gravity(q, desired.dq.data(), desired.ddq.data(), payload_, &state_, tau.data(),
+                                    std.data());
     if (adds_.coriolis) {
       lipserve_coriolis_payload(q, desired.dq.data(), payload_, part.data());
       for (std::size_t j = 0; j < kJoints; ++j) tau[j] -= part[j];

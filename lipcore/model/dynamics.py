@@ -17,13 +17,16 @@ from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import deflections_of
 from lipcore.model.functionals import (
+    Combination,
     EnergyKernel,
     Estimate,
+    add_combinations,
     combine_torques,
     kinetic_energy,
     potential_energy,
 )
 from lipcore.model.torque_model import TorqueModel
+from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.exact import Posterior
 from lipcore.vocabulary import COMPONENTS, ComponentName, offered_components
 
@@ -62,6 +65,7 @@ def components(
 
     - `inertia_matrix` (N, n, n): M(q), kg·m² if both joints are revolute;
     - `inertial`, `coriolis`, `gravity`, `friction` (N, n): M(q) ddq, c(q, dq), g(q), f(dq); the torque is their sum;
+    - `without_gravity` (N, n): the torque minus g(q), for robots that add gravity to commanded torque;
     - `kinetic_energy` (N,) J: ½ dqᵀ M(q) dq;
     - `potential_energy` (N,) J: V(q) − V(q₀), q₀ the `reference_posture`, with the uncertainty of the difference;
     - `forward_dynamics` (N, n) rad/s²: see `forward_dynamics`; needs `tau`, (N, n) N·m.
@@ -76,12 +80,13 @@ def components(
     torques = [name for name in asked if name in _TORQUES or name == "inertia_matrix"]
     if torques:
         fixed = _with_fixed_deflections(model.estimator, motion)
-        gains = [drive.gain()] if isinstance(drive, DriveKernel) and "gain" in drive.drive.kinds else []
-        estimates |= _torque_parts(posterior, SumKernel(*terms, *gains), fixed, torques)
+        estimates |= _torque_parts(posterior, SumKernel(*terms, *_gains(drive)), fixed, torques)
     if "friction" in asked:
         assert drive is not None  # `_check` has checked it
         friction = drive.friction() if isinstance(drive, DriveKernel) else drive
         estimates["friction"] = combine_torques(posterior, friction, [motion], np.eye(model.n_joints))
+    if "without_gravity" in asked:
+        estimates["without_gravity"] = _without_gravity(model, motion)
     energetic = _energy_terms(model.estimator)
     if "kinetic_energy" in asked:
         estimates["kinetic_energy"] = kinetic_energy(posterior, energetic, motion)
@@ -158,6 +163,37 @@ def _torque_parts(
         name: Estimate(_symmetric(mean, n), _symmetric(std, n)) if name == "inertia_matrix" else Estimate(mean, std)
         for name, mean, std in parts
     }
+
+
+def _without_gravity(model: TorqueModel, motion: Motion) -> Estimate:
+    """Return the torque minus gravity, with the std of the difference.
+
+    The errors that no term explains (`Misfit`) count in full: their share in gravity is unknown.
+    """
+    posterior, terms = model.posterior, model.estimator.terms
+    drive, zero, eye = terms.get("friction"), np.zeros_like(motion.q), np.eye(model.n_joints)
+    followed = motion
+    if isinstance(drive, DriveKernel) and (elements := drive.drive.elements) is not None:
+        followed = replace(motion, deflections=deflections_of(motion, elements.widths, elements.acceleration))
+    none = None if followed.deflections is None else np.zeros_like(followed.deflections)
+    dynamic = _dynamics_terms(model.estimator)
+    rest = replace(motion, dq=zero, ddq=zero, deflections=none)
+    kernel = SumKernel(*dynamic, *_gains(drive))
+    parts = [Combination(kernel, [followed, rest], np.concatenate([eye, -eye], axis=1))]
+    for term in terms.values():
+        if term not in dynamic:
+            part = term.friction() if isinstance(term, DriveKernel) else term
+            parts.append(Combination(part, [followed], eye))
+    found = add_combinations(posterior, parts)
+    if isinstance(posterior, CompactPosterior):
+        variance = np.maximum(found.std**2 + posterior.misfit.variance(motion), posterior.floor)
+        found = replace(found, std=np.sqrt(variance))
+    return found
+
+
+def _gains(drive: TorqueKernel | None) -> list[TorqueKernel]:
+    """Return the errors of torque constants, which scale gravity and inertia as the recording reads them."""
+    return [drive.gain()] if isinstance(drive, DriveKernel) and "gain" in drive.drive.kinds else []
 
 
 def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Array:

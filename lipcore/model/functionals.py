@@ -44,33 +44,56 @@ def condition(posterior: Posterior, prior_mean: Array, prior_variance: Array, cr
     return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
 
 
+@dataclass(frozen=True)
+class Combination:
+    """F linear combinations of a kernel's torques at S motions per query.
+
+    motions: S motions of N queries each, with deflections in all or none; coefficients: (F, S n), motion by motion.
+    """
+
+    kernel: TorqueKernel
+    motions: Sequence[Motion]
+    coefficients: Array
+
+    def prior(self, posterior: Posterior, rows: slice) -> tuple[Array, Array, Array]:
+        """Return prior mean and variance, (R, F), and covariance with the posterior's anchors, (M, R F), at R rows."""
+        size, kernel = len(self.motions), self.kernel
+        stacked = np.stack([motion[rows].arrays() for motion in self.motions], axis=1)  # (R, S, 3, n), or wider
+        stack = Motion.of(stacked.reshape(-1, *stacked.shape[2:]))
+        cross = posterior.cross(kernel, stack).reshape(-1, size * kernel.n_joints) @ self.coefficients.T
+        starts = range(0, len(stack), size)
+        grams = [kernel.symmetric_gram(posterior.params, stack[start : start + size]) for start in starts]
+        variance = np.stack([(self.coefficients @ gram * self.coefficients).sum(1) for gram in grams])
+        mean = kernel.mean(stack).reshape(len(grams), -1) @ self.coefficients.T
+        return mean, variance, cross.reshape(len(posterior.weights), -1)
+
+
 def combine_torques(
     posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Array
 ) -> Estimate:
-    """Return the posterior of F linear combinations of a kernel's torques at S motions per query, (N, F).
+    """Return the posterior of one `Combination`, (N, F).
 
     It is computed from the joint posterior of all S n torques. What they have in common cancels in a difference, also
-    in its uncertainty. motions: S motions of N queries each, with deflections in all or none; coefficients: (F, S n),
-    motion by motion.
+    in its uncertainty.
     """
-    n, size, count = kernel.n_joints, len(motions), len(motions[0])
-    stacked = np.stack([motion.arrays() for motion in motions], axis=1)  # (N, S, 3, n), or with deflections
+    return add_combinations(posterior, [Combination(kernel, motions, coefficients)])
+
+
+def add_combinations(posterior: Posterior, parts: Sequence[Combination]) -> Estimate:
+    """Return the posterior of a sum of combinations of different terms of the kernel, (N, F).
+
+    The terms are independent a priori. The posterior's covariances between them are included.
+    """
+    count = len(parts[0].motions[0])
     # right-hand sides are whitened together: enough for fast matrix products, few enough for tens of MB
-    step = max(1, 512 // (size * n))
+    step = max(1, 512 // (parts[0].coefficients.shape[1]))
     means, stds = [], []
     for start in range(0, count, step):
-        stack = Motion.of(stacked[start : start + step].reshape(-1, *stacked.shape[2:]))
-        queries = len(stack) // size
-        cross = posterior.cross(kernel, stack)  # (M, queries S n)
-        cross = cross.reshape(-1, size * n) @ coefficients.T
-        grams = [kernel.symmetric_gram(posterior.params, stack[k * size : (k + 1) * size]) for k in range(queries)]
-        variance = np.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])
-        mean = kernel.mean(stack).reshape(queries, -1) @ coefficients.T
-        estimate = condition(
-            posterior, mean.reshape(-1), variance.reshape(-1), cross.reshape(len(posterior.weights), -1)
-        )
-        means.append(estimate.mean.reshape(queries, -1))
-        stds.append(estimate.std.reshape(queries, -1))
+        found = [part.prior(posterior, slice(start, start + step)) for part in parts]
+        mean, variance, cross = (sum(each[1:], each[0]) for each in zip(*found, strict=True))
+        estimate = condition(posterior, mean.reshape(-1), variance.reshape(-1), cross)
+        means.append(estimate.mean.reshape(mean.shape))
+        stds.append(estimate.std.reshape(mean.shape))
     return Estimate(np.concatenate(means), np.concatenate(stds))
 
 

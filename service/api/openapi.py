@@ -138,7 +138,9 @@ def _add(path: str, method: str, operation: dict[str, Any], rules: Rules) -> Non
     if "requestBody" in operation:
         kinds += (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
     # these POST routes store nothing
-    if method != "get" and not path.endswith(("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")):
+    if method != "get" and not path.endswith(
+        ("/predict", "/gravity", "/evaluate", "/trace", "/compare", "/echo", "/infer")
+    ):
         kinds += (errors.StorageFullError,)
     protocol = f"{path}/".startswith(f"{OPEN_INFERENCE}/")
     answers = operation["responses"]

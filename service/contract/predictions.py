@@ -182,7 +182,9 @@ class PredictResponse(BaseModel):
     components: dict[ComponentName, ComponentValues] | None = Field(
         None,
         description="Requested components. `inertia_matrix` M(q), kg·m²; torques `inertial` M(q) ddq, `coriolis`, "
-        "`gravity` and `friction`, N·m, which sum to `tau` without fallback; `kinetic_energy`, J; `potential_energy`, "
+        "`gravity` and `friction`, N·m, which sum to `tau` without fallback; `without_gravity`, N·m, `tau` minus "
+        "gravity, for robots that add it; its `std` is that of the difference; `kinetic_energy`, J; "
+        "`potential_energy`, "
         "J, relative to the middle of each joint's training range; `forward_dynamics`, rad/s²: the acceleration under "
         "the given torque. Friction is only in `friction` and `forward_dynamics`. A model of gravity-compensated "
         "torques has no gravity",
@@ -194,6 +196,32 @@ class PredictResponse(BaseModel):
         "mean training torque if these are not determined either. `tau_std` is that of the full model",
         examples=[[0.0, 0.0, 0.0, 0.0, 0.35, 1.0, 0.0]],
     )
+
+
+class GravityRequest(VersionChoice):
+    """Positions at which gravity is wanted, in SI units."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        arbitrary_types_allowed=True,
+        json_schema_extra={"examples": [{"q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7]}]},
+    )
+
+    q: Vectors = Field(description="Positions, rad (prismatic: m): (n) or (N, n)")
+    min_revision: MinRevision = None
+    payload: Payload | None = Field(None, description="Payload on the last link, as in `predict`")
+
+
+class GravityResponse(BaseModel):
+    """Torques that hold the arm against gravity, in the shape of the query, without friction and its offset."""
+
+    model: str
+    version: int
+    revision: int = Field(description="Online updates applied to the version")
+    joint_names: list[str]
+    mean: list[float] | list[list[float]] = Field(description="Mean, N·m (prismatic: N)")
+    std: list[float] | list[list[float]] = Field(description="Standard deviation of the function")
 
 
 class EvaluateRequest(VersionChoice):

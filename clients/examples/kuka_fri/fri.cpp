@@ -3,8 +3,8 @@
 // KUKA LBR with the FRI client SDK: a torque overlay on joint impedance control, and a recorder.
 //     fri [FILE]     FILE: write t, q, tau of the session, to train from
 //
-// The Sunrise application plans the motion and adds gravity and Coriolis torques of KUKA's own model. The overlay is the
-// rest of the learnt torque: M(q) ddq and friction.
+// The Sunrise application plans the motion and adds gravity and Coriolis torques of KUKA's own model. The overlay is
+// the rest of the learnt torque: M(q) ddq and friction.
 
 #include <friClientApplication.h>
 #include <friLBRClient.h>

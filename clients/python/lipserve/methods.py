@@ -124,6 +124,7 @@ class Calls:
     audit = Listed(calls.models.audit)
 
     predict = One(calls.inference.predict)
+    gravity = One(calls.inference.gravity)
     evaluate = One(calls.inference.evaluate)
     compare = One(calls.inference.compare)
     trace = One(calls.inference.trace)

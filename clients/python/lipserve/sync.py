@@ -9,12 +9,15 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import httpx
+import numpy as np
+from numpy.typing import ArrayLike
 
 from lipserve import sending
 from lipserve.call import Answer, Call, Page, bound
 from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, reporting
 from lipserve.records.jobs import Job
 from lipserve.records.learning import Learning
+from lipserve.results.series import Component
 from lipserve.stream import StreamClient
 
 P = ParamSpec("P")
@@ -111,6 +114,27 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
             while not report(seen := self.job(name)):
                 time.sleep(POLL_SECONDS)
         return seen
+
+    def mass_matrix(self, model: str, q: ArrayLike, **options: Any) -> Component:
+        """Return the inertia matrix M(q) at one or N postures, (…, n, n), rotors included. Options: those of `predict`.
+
+        Example:
+            >>> client.mass_matrix("panda-sim", [0.0] * 7).mean
+        """
+        rest = np.zeros_like(q, np.float64)
+        answer = self.predict(model, q, rest, rest, components=["inertia_matrix"], **options)
+        assert answer.components is not None
+        return answer.components["inertia_matrix"]
+
+    def coriolis(self, model: str, q: ArrayLike, dq: ArrayLike, **options: Any) -> Component:
+        """Return the Coriolis and centrifugal torque c(q, dq) at one or N states, (…, n). Options: those of `predict`.
+
+        Example:
+            >>> client.coriolis("panda-sim", [0.0] * 7, [0.1] * 7).mean
+        """
+        answer = self.predict(model, q, dq, np.zeros_like(q, np.float64), components=["coriolis"], **options)
+        assert answer.components is not None
+        return answer.components["coriolis"]
 
     def set_learning(self, model: str, **options: Any) -> Learning:
         """Set learning options of a model by name; others keep their values. Names: see `LearningOptions`."""

@@ -38,7 +38,7 @@ _MEAN = "mean"
 INLINE_OUTPUTS = MODEL_OUTPUTS | EXTERNAL_OUTPUTS.keys() | {"tau", "tau_std", FALLBACK}
 """Outputs that are computed on the event loop for a single query."""
 _STD = "_std"
-_TORQUES = ("gravity", "coriolis", "inertial", "friction")
+_TORQUES = ("gravity", "coriolis", "inertial", "friction", "without_gravity")
 
 
 class ComponentTensor(NamedTuple):

@@ -23,6 +23,7 @@ from service.foundation.errors import (
     UnreadableVersionError,
 )
 from service.inference import comparison, evaluating, predicting
+from service.inference.gravity import gravity as gravity_torque
 from service.inference.predicting import encode, one_motion, queries
 from service.models.loaded import LoadedModels
 from service.models.served import ServedModel, wait_for_revision
@@ -105,7 +106,7 @@ async def _in_thread(
 
 
 async def _revised(
-    loaded: LoadedModels, model: str, request: schema.PredictRequest | schema.EvaluateRequest
+    loaded: LoadedModels, model: str, request: schema.PredictRequest | schema.GravityRequest | schema.EvaluateRequest
 ) -> ServedModel | None:
     """Wait for the revision that a request asks for and return its version, None if it asks for none."""
     if request.min_revision is None:
@@ -135,6 +136,19 @@ hot.add_api_route(
     responses=_LATE,
     route_class_override=hot_route(_answer),
 )
+
+
+@router.post("/{model}/gravity", summary="Return the gravity torque", responses=_LATE)
+@needs(PREDICT)
+async def gravity(
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.GravityRequest
+) -> schema.GravityResponse:
+    """Return the torque that holds the arm against gravity at one posture or a batch, with its standard deviation.
+
+    It needs neither `dq` nor `ddq`. A torque without gravity is the component `without_gravity` of `predict`.
+    """
+    served = await _revised(loaded, model, request)
+    return await to_thread.run_sync(gravity_torque, loaded, model, request, served, limiter=turns)
 
 
 @router.post("/{model}/evaluate", summary="Evaluate a model on a data set", responses=_LATE)

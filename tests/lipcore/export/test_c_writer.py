@@ -361,6 +361,27 @@ def test_parts_are_the_components_of_the_model(name: str, tmp_path: Path) -> Non
 
 
 @needs_compiler
+@pytest.mark.parametrize("name", few(MODELS, kept=lambda name: name == "panda"))
+def test_torque_without_gravity_has_the_std_of_the_difference(name: str, tmp_path: Path) -> None:
+    model, body = MODELS[name](), BODY
+    path, motion = compile_library(c_files(model, ORIGIN), tmp_path), draw_motions(model, 20, 1)
+    carried = Carrier(model)
+    for asked, payload in ((model, None), (carried.with_payload(carried.known(body.parameters)), body)):
+        expected = dynamics.components(asked, Motion(*motion), ["without_gravity"])["without_gravity"]
+        carrying = None if payload is None else ctypes.byref(c_payload(payload))
+        tau, std = np.full((2, *motion.shape[1:]), np.nan)
+        for k in range(motion.shape[1]):
+            query = [c_array(np.ascontiguousarray(part[k])) for part in motion]
+            arguments = (*query, carrying, None, c_array(tau[k]), c_array(std[k]))
+            ctypes.CDLL(str(path)).lipserve_torque_without_gravity(*arguments)
+        np.testing.assert_allclose(tau, expected.mean, rtol=1e-8, atol=1e-10 * np.abs(motion).max())
+        if "energies" in name:
+            assert np.isnan(std).all()
+        else:
+            np.testing.assert_allclose(std, expected.std, rtol=1e-5)
+
+
+@needs_compiler
 @pytest.mark.parametrize("kinds", ["RPR", slow("RRRRRR")])
 def test_parts_are_those_of_pinocchio(kinds: str, tmp_path: Path) -> None:
     """A model with the weights of a known robot: bodies, rotors and a payload at its last joint."""

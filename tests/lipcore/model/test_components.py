@@ -61,6 +61,7 @@ MAX_RELATIVE_ERROR = {
     "gravity": 0.001,
     "inertial": 0.005,
     "friction": 0.01,
+    "without_gravity": 0.005,
     "kinetic_energy": 0.002,
     "potential_energy": 0.002,
     "forward_dynamics": 0.05,
@@ -108,6 +109,7 @@ def pinocchio_components(robot: Robot, unseen: Samples, reference: np.ndarray, v
             "coriolis": pin.rnea(model, data, q, v, rest) - gravity,
             "inertial": inertia @ a,
             "friction": friction,
+            "without_gravity": pin.rnea(model, data, q, v, a) - gravity + friction,
             "kinetic_energy": pin.computeKineticEnergy(model, data, q, v),
             "potential_energy": pin.computePotentialEnergy(model, data, q) - bottom,
             "forward_dynamics": pin.aba(model, data, q, v, unseen.tau[row] - friction).copy(),
@@ -341,6 +343,26 @@ def test_torques_and_inertia_match_the_dense_posterior(small_model: SmallModel, 
     found = dynamics.components(small_model.model, small_model.query, list(differences))
     for name, rows in differences.items():
         assert_estimate(found[name], row, *condition(small_model, rows @ prior @ rows.T, rows @ cross))
+
+
+@pytest.mark.parametrize("row", EACH_QUERY)
+def test_torque_without_gravity_matches_the_dense_posterior(small_model: SmallModel, row: int) -> None:
+    """The prior of a difference of two torques, and of the friction of one of them."""
+    q, v, a = instant(small_model.query, row)
+    zero, minus = torch.zeros(N, dtype=torch.float64), np.concatenate([np.eye(N), -np.eye(N)], axis=1)
+    params, data, stack = (
+        small_model.model.posterior.params,
+        instants_of(small_model.motion),
+        [(q, v, a), (q, zero, zero)],
+    )
+    prior = minus @ torque_covariance(small_model.energies, stack, stack) @ minus.T
+    cross = minus @ torque_covariance(small_model.energies, stack, data)
+    prior, cross = (
+        prior + friction_covariance(params, stack[:1], stack[:1]),
+        cross + friction_covariance(params, stack[:1], data),
+    )
+    found = dynamics.components(small_model.model, small_model.query, ["without_gravity"])["without_gravity"]
+    assert_estimate(found, row, *condition(small_model, prior, cross))
 
 
 @pytest.mark.parametrize("row", EACH_QUERY)

@@ -22,7 +22,7 @@ from lipserve.records.server import (
 )
 from lipserve.results import Array, array
 from lipserve.results.evaluation import Comparison, Evaluation, read_comparison, read_evaluation
-from lipserve.results.series import Prediction, Trace, read_prediction, read_trace
+from lipserve.results.series import Component, Prediction, Trace, read_component, read_prediction, read_trace
 
 
 @route("POST", "/v1/models/{model}/predict", repeatable=True)
@@ -87,6 +87,40 @@ def predict(
     name, which = split_name(model, version, alias)
     body |= which | given(min_revision=min_revision)
     return _route(read_prediction, names={"model": name}, json=body)
+
+
+@route("POST", "/v1/models/{model}/gravity", repeatable=True)
+def gravity(
+    _route: Route,
+    model: str,
+    q: ArrayLike,
+    version: int | None = None,
+    alias: str | None = None,
+    min_revision: int | None = None,
+    payload: Mapping[str, ArrayLike] | None = None,
+) -> Call[Component]:
+    """Return the torque that holds the arm against gravity at one or N postures.
+
+    Args:
+        model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
+        q: (n,) or (N, n) positions, rad (prismatic: m).
+        version: Version number. Default: the serving version.
+        alias: Alias of the version, instead of its number.
+        min_revision: Min revision of the answer; see `predict`.
+        payload: As in `predict`.
+
+    Returns:
+        Mean and standard deviation, shaped as q, N·m (prismatic: N).
+
+    Example:
+        >>> client.gravity("panda-sim", [0.0] * 7).mean
+    """
+    body: dict[str, Any] = {"q": np.asarray(q, dtype=np.float64).tolist()}
+    if payload is not None:
+        body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
+    name, which = split_name(model, version, alias)
+    body |= which | given(min_revision=min_revision)
+    return _route(read_component, names={"model": name}, json=body)
 
 
 @route("POST", "/v1/models/{model}/evaluate", repeatable=True)

@@ -151,6 +151,7 @@ class Version(Record, frozen=True, kw_only=True):
             "gravity",
             "inertial",
             "friction",
+            "without_gravity",
             "kinetic_energy",
             "potential_energy",
             "forward_dynamics",

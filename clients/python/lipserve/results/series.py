@@ -104,6 +104,7 @@ class Prediction(Plain):
         return interval(self.tau, self.tau_std, self.noise_std, level, self.scale)
 
 
+read_component = reading(Component)
 read_prediction = reading(Prediction)
 
 

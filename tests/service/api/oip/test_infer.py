@@ -13,7 +13,7 @@ from tests.service.api.oip.requests import infer, json_input, message, tensors
 from tests.service.data import service_of
 
 EXACT = {"rtol": 1e-9, "atol": 1e-12}
-TORQUES = {"tau_gravity": "gravity", "tau_coriolis": "coriolis", "tau_inertial": "inertial", "tau_friction": "friction"}
+TORQUES = {f"tau_{part}": part for part in ("gravity", "coriolis", "inertial", "friction", "without_gravity")}
 MATRIX, ENERGIES = "inertia_matrix", ("kinetic_energy", "potential_energy")
 
 

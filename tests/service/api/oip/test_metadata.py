@@ -8,7 +8,7 @@ from tests.service.api.oip.requests import error_message
 from tests.service.data import service_of
 
 EACH = {"tau": [2], "kinetic_energy": [1], "potential_energy": [1], "forward_dynamics": [2], "inertia_matrix": [2, 2]}
-EACH |= {f"tau_{part}": [2] for part in ("coriolis", "gravity", "inertial", "friction")}
+EACH |= {f"tau_{part}": [2] for part in ("coriolis", "gravity", "inertial", "friction", "without_gravity")}
 ENERGETIC = {name + end: [-1, *shape] for name, shape in EACH.items() for end in ("", "_std")}
 ENERGETIC |= {"noise_std": [2], "scale": [2], "covariance": [-1, 2, 2], "fallback": [-1, 2]}
 ENERGETIC |= {f"tau_external{end}": [-1, 2] for end in ("", "_std", "_z")}
