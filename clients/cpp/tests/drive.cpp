@@ -234,7 +234,7 @@ int main(int count, char** arguments) {
   options.joints = static_cast<unsigned>(number("joints", 2));
   options.version = static_cast<unsigned>(number("version", 0));
   options.scale = given.count("scale") > 0, options.payload = given.count("payload") > 0;
-  options.rich = given.count("rich") > 0;
+  options.rich = given.count("rich") > 0, options.without_gravity = given.count("without_gravity") > 0;
   options.first_sequence = static_cast<std::uint32_t>(number("first_sequence", 1));
   options.backlog = static_cast<std::size_t>(number("backlog", static_cast<double>(options.backlog)));
   options.window = static_cast<unsigned>(number("window", options.window));

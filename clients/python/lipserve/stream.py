@@ -69,6 +69,7 @@ class _Stream(StreamSide):
         scale: bool = False,
         payload: bool = False,
         rich: bool = False,
+        without_gravity: bool = False,
     ) -> None:
         headers = headers_of(key)
         address = Address.of(url_of(url))
@@ -77,7 +78,7 @@ class _Stream(StreamSide):
         self._exchange = Exchange(stream_id, first_sequence)
         model, which = split_name(model, version, alias)
         query = {**which, "stream_id": stream_id}
-        flags = {"scale": scale, "payload": payload, "rich": rich}
+        flags = {"scale": scale, "payload": payload, "rich": rich, "without_gravity": without_gravity}
         query |= {name: 1 if wanted else None for name, wanted in flags.items()}
         self._destination = destination(address.base, model, **query)
         self._options: dict[str, Any] = {
@@ -163,6 +164,8 @@ class StreamClient(_Stream):
         scale: Request the factor on the half width of intervals with every answer.
         payload: Request the estimated payload with every answer.
         rich: Answer from all centres of a correction (`rigid-body+local`), which takes longer.
+        without_gravity: Return torques minus gravity, with the standard deviation of the difference, for robots that
+            add gravity. It takes about 1 ms longer.
 
     Raises:
         StreamError: The service cannot be reached or refuses the stream.

@@ -30,6 +30,7 @@ PARAMETERS = {
     "scale": ("[01]", "0 or 1"),
     "payload": ("[01]", "0 or 1"),
     "rich": ("[01]", "0 or 1"),
+    "without_gravity": ("[01]", "0 or 1"),
     "stream_id": (STREAM_ID, f"a name that matches {STREAM_ID}"),
     "min_revision": (NUMBER, "a revision of the version"),
 }
@@ -94,7 +95,8 @@ class StreamRoute(EchoRoute):
         pinned = version is not None
         meter = scope["app"].state.meters.stream(served.name)
         given = (served, meter, pinned, asked.std, asked.stream_id, alias, asked.scale, asked.payload, asked.rich)
-        return Session(_connection(scope), receive, send, learners, *given)
+        connection = _connection(scope)
+        return Session(connection, receive, send, learners, *given, without_gravity=asked.without_gravity)
 
 
 class NoRoute:
@@ -118,6 +120,7 @@ class StreamParameters(NamedTuple):
     scale: bool
     payload: bool
     rich: bool
+    without_gravity: bool
 
 
 def _parameters(query: bytes) -> StreamParameters:
@@ -135,7 +138,7 @@ def _parameters(query: bytes) -> StreamParameters:
     version = int(given["version"]) if "version" in given else None
     one_choice(version, given.get("alias"))
     std, revision = given.get("std") == "1", int(given.get("min_revision", 0))
-    flags = (given.get(name) == "1" for name in ("scale", "payload", "rich"))
+    flags = (given.get(name) == "1" for name in ("scale", "payload", "rich", "without_gravity"))
     return StreamParameters(version, given.get("alias"), std, given.get("stream_id"), revision, *flags)
 
 

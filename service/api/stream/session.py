@@ -16,8 +16,11 @@ import numpy as np
 from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
+from lipcore.data.motion import Motion
 from lipcore.kernels.drive.play import PlayFollower, element_widths
+from lipcore.model import dynamics
 from lipcore.model.external import external
+from lipcore.vocabulary import offered_components
 from service.api.access.middleware import subprotocol_of
 from service.api.errors import UNEXPECTED_ERROR
 from service.api.limits.requests import PATIENCE
@@ -195,6 +198,7 @@ class Session(Conversation):
         scale: Whether every answer includes the factor on the half width of its intervals.
         payload: Whether every answer includes the mass of the payload.
         rich: Whether answers use all centres of a correction.
+        without_gravity: Whether answers contain the torque minus gravity.
     """
 
     def __init__(
@@ -212,6 +216,7 @@ class Session(Conversation):
         scale: bool = False,
         payload: bool = False,
         rich: bool = False,
+        without_gravity: bool = False,
     ) -> None:
         super().__init__(connection, receive, send, learners.settings)
         self._loaded, self._name = learners.loaded, served.name
@@ -219,7 +224,7 @@ class Session(Conversation):
         self._alias = None if alias == SERVING else alias
         self._sends_std, self._late = std, 0
         self._sends_scale, self._sends_payload, self._stream_id = scale, payload, stream_id
-        self._rich = rich
+        self._rich, self._without_gravity = rich, without_gravity
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
         self._learning = None if stream_id is None else FrameLearning(learners, stream_id, self.send_text)
         self._follower: PlayFollower | None = None  # a session's frames are one motion
@@ -278,6 +283,7 @@ class Session(Conversation):
                 check_answer("tau_std", std)
             factor, more = self._served.scales.of(self._stream_id), b""
             mean = tau if fallback is None else fallback.mean  # posterior mean for learning and external torque
+            reduced = await self._reduced(motion, tau - mean) if self._without_gravity else None
             if compares:
                 more = self._external(data, mean, std, covariance, factor)
         except ServiceError as error:
@@ -287,6 +293,9 @@ class Session(Conversation):
             return self._refuse(sequence, flags, arrived, ServiceError(UNEXPECTED_ERROR))
         served = self._served
         flags, numbers = self._numbers(sequence, asked, arrived, data, tau, std, factor, more, mean)
+        if reduced is not None:
+            size = (2 if flags & frames.HAS_STD else 1) * tau.nbytes
+            numbers = reduced.tobytes()[:size] + numbers[size:]
         if fallback is not None:
             flags |= frames.FALLBACK
         seconds = perf_counter() - arrived
@@ -307,6 +316,17 @@ class Session(Conversation):
             expected = f"a name in the address, as in ?stream_id=arm-1, for flag {frames.ASK_LEARN}"
             raise invalid_request("stream_id", "missing", expected)
         await self._learning.admit(sequence)
+
+    async def _reduced(self, motion: Array, more: Array) -> Array:
+        """Return the torque minus gravity, and its standard deviation, (2, n). more: what the answer adds, (n,)."""
+        model = self._payload_model or self._served.model
+        found = await to_thread.run_sync(
+            dynamics.components, model, Motion.of(motion[None].copy()), ["without_gravity"]
+        )
+        estimate = found["without_gravity"]
+        reduced = np.stack([estimate.mean[0] + more, estimate.std[0]])
+        check_answer("tau_without_gravity", reduced)
+        return reduced
 
     def _external(self, data: bytes, mean: Array, std: Array | None, covariance: Array | None, factor: Array) -> bytes:
         """Return the bytes of the external torque of a frame; raise InvalidRequestError."""
@@ -380,6 +400,9 @@ class Session(Conversation):
             await self.greet()
 
     def _use_version(self, served: ServedModel) -> None:
+        if self._without_gravity and "without_gravity" not in offered_components(served.model.estimator.name):
+            message = f"This model cannot separate gravity: its estimator is {served.model.estimator.name}."
+            raise invalid_request("without_gravity", "1", "0, or a model with gravity", message)
         self._served, self._payloads, self._noise_std = served, served.payloads, np.array(served.noise_std)
         self._update_payload()
         if not served.model.remembers:

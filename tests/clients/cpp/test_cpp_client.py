@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 import lipcore
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
 from service.api.access import keys
 from service.foundation.settings import Settings
 from service.storage.database import Database
@@ -65,6 +67,20 @@ def test_answers_match_the_model(driver, server, url, panda):
             assert (report["scale"], report["version"]) == ([1.0] * 7, 1)
             assert np.isnan(report["payload"]).all()
         assert (report["asked"], report["answered"], report["stale"], report["connections"]) == (40, 40, 0, 1)
+
+
+def test_torque_without_gravity_has_its_own_deviation(driver, server, panda):
+    motions = panda_rows(5)
+    with Driver(driver, motions, url=server.url, without_gravity=1, **PANDA) as client:
+        client.do(f"connect {FAR}")
+        for number, row in enumerate(motions):
+            motion = Motion(*row[:3, None])
+            expected = dynamics.components(panda, motion, ["without_gravity"])["without_gravity"]
+            report = client.do(f"ask {number} {FAR} std")
+            np.testing.assert_allclose(report["tau"], expected.mean[0], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(report["tau_std"], expected.std[0], rtol=1e-6)
+            report = client.do(f"ask {number} {FAR} external")
+            np.testing.assert_allclose(report["tau_external"], row[3] - panda.answer(row[:3])[0], rtol=1e-9, atol=1e-9)
 
 
 def test_ask_with_learn_learns_after_the_answer(driver, server, panda):

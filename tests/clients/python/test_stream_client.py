@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from websockets.sync.server import unix_serve
 
+from lipcore.data.motion import Motion
+from lipcore.model import dynamics
 from lipserve import AsyncStreamClient, StreamClient, StreamError
 from lipserve.stream import StreamRefusal
 from tests.service.data import DEADLINE
@@ -91,6 +93,21 @@ class Scripted:
 def scripted(tmp_path):
     """Makes a server that follows a script."""
     return lambda *script, **hello: Scripted(tmp_path / "lipserve.sock", *script, **hello)
+
+
+def test_torque_without_gravity_has_its_own_deviation(streaming):
+    motion = Motion(*np.array(PAIR, float)[:, None])
+    part = dynamics.components(streaming.model, motion, ["without_gravity"])["without_gravity"]
+    whole = streaming.model.posterior.mean(motion)[0]
+    with client_of(streaming, without_gravity=True) as client:
+        answer = client.predict(*PAIR, tau=whole + 1.0, external=True)
+        np.testing.assert_allclose(answer.tau, part.mean[0], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(answer.tau_std, part.std[0], rtol=1e-5)
+        np.testing.assert_allclose(answer.external.tau, 1.0, rtol=1e-6)
+        assert np.abs(answer.tau - whole).max() > 1e-3
+        bare = client.predict(*PAIR, std=False)
+        assert bare.tau_std is None
+        np.testing.assert_allclose(bare.tau, part.mean[0], rtol=1e-6, atol=1e-9)
 
 
 def test_deadlines_are_reported(streaming):

@@ -174,6 +174,7 @@ struct Options {
   bool scale = false;               // request the factor on intervals with every answer
   bool payload = false;             // request the estimated payload with every answer
   bool rich = false;                // answer from all centres of a correction, which takes longer
+  bool without_gravity = false;     // torques minus gravity, for robots that add it; takes about 1 ms longer
   /// Sequence of the first frame. The service remembers the sequences of a stream_id: to continue one, start above the
   /// last sequence sent.
   std::uint32_t first_sequence = 1;
@@ -972,6 +973,7 @@ inline bool Client::read_options(const Options& options) {
   if (options.scale) ask_for("scale").add('1');
   if (options.payload) ask_for("payload").add('1');
   if (options.rich) ask_for("rich").add('1');
+  if (options.without_gravity) ask_for("without_gravity").add('1');
   request.add(" HTTP/1.1\r\nHost: ").add(host_).add("\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n");
   if (key && *key) request.add("Authorization: Bearer ").add(key).add("\r\n");
   request.add("Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: ");
