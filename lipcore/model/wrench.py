@@ -48,6 +48,11 @@ class Wrench:
         return np.sqrt(self.base_covariance.diagonal())
 
 
+def has_wrench(model: TorqueModel) -> bool:
+    """Return whether a model's arm has the geometry of a URDF and enough joints for a wrench."""
+    return model.arm is not None and model.arm.mode != "learn" and model.n_joints >= 6
+
+
 def external_wrench(model: TorqueModel, motion: Array, tau: Array, scale: Array | None = None) -> Wrench:
     """Return the wrench at the last link that explains a measured torque.
 

@@ -8,8 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lipcore.data.motion import Motion
 from lipcore.model.external import external
 from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePrediction
+from lipcore.model.wrench import NoWrenchError, external_wrench, has_wrench
 from lipcore.vocabulary import COMPONENTS, ComponentName, offered_components
 from service.api.oip import schema
 from service.api.oip.sequences import Sequences, read_part
@@ -31,6 +33,8 @@ ARM_OUTPUTS = {"tau_external_statistic": "statistic", "tau_external_p": "p"}
 """External torque outputs with one number per query. They need the covariance."""
 EXTERNAL_OUTPUTS = {"tau_external": "tau", "tau_external_std": "std", "tau_external_z": "z"} | ARM_OUTPUTS
 """External torque outputs, and the property of `External` that they return."""
+WRENCH_OUTPUTS = {f"wrench_{part}{end}": f"{part}{end}" for part in ("link", "base") for end in ("", "_std")}
+"""Outputs with six numbers per query, of models with the geometry of a URDF, and the property of `Wrench`."""
 FALLBACK = "fallback"
 """Output with the share of the fallback in `tau`."""
 _MEAN = "mean"
@@ -55,7 +59,7 @@ COMPONENT_TENSORS: dict[str, ComponentTensor] = {
 }
 """Component tensors by name. Names of torque components begin with `tau_`."""
 OUTPUTS_NEEDING_TORQUE = {name for name, part in COMPONENT_TENSORS.items() if part.component == FORWARD}
-OUTPUTS_NEEDING_TORQUE |= EXTERNAL_OUTPUTS.keys()
+OUTPUTS_NEEDING_TORQUE |= EXTERNAL_OUTPUTS.keys() | WRENCH_OUTPUTS.keys()
 
 
 def shapes(model: TorqueModel) -> dict[str, Shape]:
@@ -64,6 +68,8 @@ def shapes(model: TorqueModel) -> dict[str, Shape]:
     tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n), FALLBACK: (-1, n)}
     tensors |= dict.fromkeys(sorted(MODEL_OUTPUTS), (n,))
     tensors |= {name: (-1, 1) if name in ARM_OUTPUTS else (-1, n) for name in EXTERNAL_OUTPUTS}
+    if has_wrench(model):
+        tensors |= dict.fromkeys(WRENCH_OUTPUTS, (-1, 6))
     for name, part in COMPONENT_TENSORS.items():
         if part.component in offered:
             tensors[name] = _shape(part.component, n)
@@ -132,6 +138,7 @@ def _outputs(request: schema.InferRequest, model: TorqueModel) -> dict[str, bool
         if (part is None or part.component not in offered_components(model.estimator.name)) and name not in (
             *INLINE_OUTPUTS,
             "covariance",
+            *(WRENCH_OUTPUTS if has_wrench(model) else ()),
         ):
             expected = f"an output of estimator {model.estimator.name}: {', '.join(shapes(model))}"
             raise invalid_request(f"{field}.name", name, expected)
@@ -210,6 +217,7 @@ def compute(served: ServedModel, task: InferTask) -> dict[str, Array]:
         between = tensors["covariance"] if of_arm else None
         seen = external(query.values[3], tensors[_MEAN], tensors["tau_std"], model.noise_std, scale, between)
         tensors |= {name: _rows(getattr(seen, EXTERNAL_OUTPUTS[name])) for name in compared}
+    tensors |= _wrenches(model, task, scale, names & WRENCH_OUTPUTS.keys())
     parts = {name: COMPONENT_TENSORS[name] for name in names if name in COMPONENT_TENSORS}
     if parts:
         estimates = query.components(model, sorted({part.component for part in parts.values()}), task.deflections)
@@ -217,6 +225,22 @@ def compute(served: ServedModel, task: InferTask) -> dict[str, Array]:
             estimate = estimates[part.component]
             tensors[name] = _rows(estimate.std if part.std else estimate.mean)
     return tensors
+
+
+def _wrenches(model: TorqueModel, task: InferTask, scale: Array, names: frozenset[str]) -> dict[str, Array]:
+    """Return the named parts of the wrench, (N, 6); raise InvalidRequestError for a singular posture."""
+    if not names:
+        return {}
+    q, dq, ddq, measured = task.query.values
+    motion, found = Motion(q, dq, ddq, task.deflections).arrays(), []
+    for row, tau in enumerate(measured):
+        try:
+            found.append(external_wrench(model, motion[row], tau, scale))
+        except NoWrenchError as error:
+            field = "q" if task.query.single else f"q[{row}]"
+            message = f"At `{field}`, {error}."
+            raise invalid_request(field, "a singular posture", "a posture away from singular ones", message) from error
+    return {name: np.stack([getattr(each, WRENCH_OUTPUTS[name]) for each in found]) for name in names}
 
 
 def _rows(values: Array) -> Array:

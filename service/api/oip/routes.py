@@ -127,6 +127,10 @@ async def infer(request: Request) -> Response:
     - `tau_external_z` [n]: `tau_external` / `tau_external_std`.
     - `tau_external_statistic`: eᵀ C⁻¹ e of all joints together; χ² with n degrees of freedom without contact.
     - `tau_external_p`: the probability of a larger statistic without contact.
+    - `wrench_base` [6]: force, N, and moment about the origin of the last link, N·m, that act on the arm, in the axes
+      of the base; `wrench_link`: in the axes of the last link. Only of models with the geometry of a URDF and at least
+      6 joints. A singular posture is an error.
+    - `wrench_base_std`, `wrench_link_std` [6]: their standard deviations.
     """
     # only for the documentation: `_answer` answers every request
     reply = await _answer(request.scope, await request.body())
