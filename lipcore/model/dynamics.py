@@ -171,6 +171,8 @@ def _without_gravity(model: TorqueModel, motion: Motion) -> Estimate:
     The errors that no term explains (`Misfit`) count in full: their share in gravity is unknown.
     """
     posterior, terms = model.posterior, model.estimator.terms
+    if model.separates_gravity:
+        return Estimate(*model.evaluator.without_gravity(motion.arrays()))
     drive, zero, eye = terms.get("friction"), np.zeros_like(motion.q), np.eye(model.n_joints)
     followed = motion
     if isinstance(drive, DriveKernel) and (elements := drive.drive.elements) is not None:

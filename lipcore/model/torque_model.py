@@ -249,6 +249,11 @@ class TorqueModel:
         """Whether friction depends on the motion before a state."""
         return self.posterior.misfit.elements.size > 0
 
+    @property
+    def separates_gravity(self) -> bool:
+        """Whether `evaluator` computes its torque without gravity: it has bodies and no nonlinear term."""
+        return self.arm is not None and self.evaluator.separates_gravity
+
     def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
         """Return the torque at one instant, and its standard deviation if `std`, both (n,) N·m.
 
@@ -260,13 +265,21 @@ class TorqueModel:
         tau, deviation, share = self.evaluator.one(motion, std)
         return tau if share is None else self._harmless(motion, tau, share), deviation
 
-    def answer_fully(self, motion: Array, std: bool = True, covariance: bool = False) -> TorqueAnswer:
-        """Return the torque like `answer`, with the fallback and, if requested together with std, the covariance."""
+    def answer_fully(
+        self, motion: Array, std: bool = True, covariance: bool = False, reduced: Array | None = None
+    ) -> TorqueAnswer:
+        """Return the torque like `answer`, with the fallback and, if requested together with std, the covariance.
+
+        reduced: (2, n), receives the torque to send minus gravity, and the standard deviation of the difference. Only
+        for a model that `separates_gravity`.
+        """
         between = np.empty((1, self.n_joints, self.n_joints)) if covariance else None
-        mean, deviation, share = self.evaluator.one(motion, std, between)
+        mean, deviation, share = self.evaluator.one(motion, std, between, reduced)
         tau, fallback = mean, None
         if share is not None:
             tau, fallback = self._harmless(motion, mean, share), Fallback(share, mean)
+            if reduced is not None:
+                reduced[0] += tau - mean
         return TorqueAnswer(tau, deviation, None if between is None else between[0], fallback)
 
     def _harmless(self, motion: Array, tau: Array, share: Array) -> Array:

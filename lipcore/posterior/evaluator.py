@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from lipcore.kernels.fast.answer import (
     pack_joints,
 )
 from lipcore.kernels.fast.play import POSITIONS
+from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.misfit import Misfit
@@ -48,6 +50,8 @@ class _Scratch(threading.local):
         self.deflected = np.zeros((queries, POSITIONS + 2 * len(ELEMENTS), n))
         self.blocks = np.zeros((queries, samples + 1, n, n))
         self.features = np.zeros((queries, linear, n))
+        self.still = np.zeros((queries, POSITIONS, n))
+        self.gravity = np.zeros((queries, linear, n))
         self.memory = np.zeros(groups * WIDTH * (queries * anchors + ROWS))
         self.std = np.zeros((queries, n))
         self.covariance = np.zeros((queries, n, n))
@@ -64,6 +68,16 @@ class _Scratch(threading.local):
             self.std,
             self.share,
         )
+
+
+class _GravityTerm(NamedTuple):
+    """A linear term with gravity: places of its features with gravity, all of its features, and what fills them."""
+
+    places: slice | Indices
+    first: int
+    last: int
+    fill: Callable[[Array, Array], None]
+    fill_many: Callable[[Array, Array, int], None]
 
 
 class Evaluator:
@@ -118,6 +132,7 @@ class Evaluator:
         _check(self._outputs, samples * n, weights, root, len(means))
         self._fills, self._fills_many, self._residual = [], [], None
         self._payload = slice(0, 0)
+        self._gravity: list[_GravityTerm] = []
         first = 0
         for kernel in linear:
             regressor = kernel.regressor()
@@ -129,6 +144,8 @@ class Evaluator:
                 self._fills_many.append((first, regressor.fill_many, isinstance(kernel, DriveKernel | PayloadKernel)))
             if isinstance(kernel, PayloadKernel):
                 self._payload = slice(first, last)
+            if (places := _gravity_places(kernel, first, last)) is not None:
+                self._gravity.append(_GravityTerm(places, first, last, regressor.fill, regressor.fill_many))
             first = last
         if self._residual is not None and term is not None:
             raise ValueError("linear has a residual beside a nonlinear term, expected one of them")
@@ -180,16 +197,22 @@ class Evaluator:
         other._residual = first, kernel.fast
         return other
 
+    @property
+    def separates_gravity(self) -> bool:
+        """Whether it computes torques without gravity: it has no nonlinear term."""
+        return self._cross is None
+
     def one(
-        self, motion: Array, std: bool = True, covariance: Array | None = None
+        self, motion: Array, std: bool = True, covariance: Array | None = None, reduced: Array | None = None
     ) -> tuple[Array, Array | None, Array | None]:
         """Return the torque, (n,), at one query, and its standard deviation, (n,), if `std`.
 
         motion: q, dq and ddq, (3, n), then the deflections if they are known, see `Motion.arrays`.
 
         Third, return the share of the fallback, (n,), or None if it is zero for all joints. covariance: (1, n, n),
-        receives the covariance between the joints if given, with std. Neither shape nor finiteness is checked. The
-        numbers are those of `many`, to the last bit.
+        receives the covariance between the joints if given, with std. reduced: (2, n), receives the torque without
+        gravity and its standard deviation, see `without_gravity`. Neither shape nor finiteness is checked. The numbers
+        are those of `many`, to the last bit.
         """
         scratch, what = self._one, STD if std or self._falls_back else MEAN
         # slicing would cost as much as the arithmetic
@@ -230,7 +253,36 @@ class Evaluator:
         )
         if self._residual is not None:
             tau += prior[0]
-        return tau[0], deviation[0] if std else None, share[0].copy() if doubtful else None
+        fallback = share[0].copy() if doubtful else None
+        if reduced is not None:
+            scratch.still[0, 0] = motion[0]
+            for each in self._gravity:
+                each.fill(scratch.still[0], scratch.gravity[0, each.first : each.last])
+                features[0, each.places] -= scratch.gravity[0, each.places]
+            answer_one(
+                self._fixed,
+                self._outputs,
+                self._places,
+                self._counts,
+                blocks,
+                features,
+                prior[1],
+                self._std_factor,
+                self._floor,
+                self._misfit,
+                SIGN_WIDTH,
+                self._usual,
+                query,
+                STD,
+                memory,
+                reduced[:1],
+                reduced[1:],
+                scratch.covariance,
+                share,
+            )
+            if self._residual is not None:
+                reduced[0] += prior[0, 0]
+        return tau[0], deviation[0] if std else None, fallback
 
     def many(
         self, q: Array, dq: Array, ddq: Array, covariance: bool = False, deflections: Array | None = None
@@ -256,6 +308,24 @@ class Evaluator:
             what = STD if covariances is None else COVARIANCE
             doubtful |= self._answer(scratch, motions, motions, what, tau[rows], std[rows], work, share[rows])
         return tau, std, covariances, share if doubtful else None
+
+    def without_gravity(self, motions: Array) -> tuple[Array, Array]:
+        """Return the torques minus gravity at N queries, and the standard deviations of the differences, (N, n) each.
+
+        Gravity is the torque of bodies and payload at rest in the same posture, with their gains. The features of a
+        difference are the difference of the features. Misfit and variance beyond a residual count in full: their share
+        in gravity is unknown. Only without a nonlinear term. motions: as of `Motion.arrays`.
+        """
+        scratch, (size, _, n) = self._many, motions.shape
+        tau, std = np.empty((size, n)), np.empty((size, n))
+        for start in range(0, size, QUERIES):
+            moving = np.ascontiguousarray(motions[start : start + QUERIES])
+            rows, count = slice(start, start + len(moving)), len(moving)
+            still = scratch.still[:count]
+            still[:, 0] = moving[:, 0]
+            outputs = STD, tau[rows], std[rows], scratch.covariance[:count], scratch.share[:count]
+            self._answer(scratch, moving, moving, *outputs, still)
+        return tau, std
 
     def fall_back(self, motions: Array, tau: Array, share: Array) -> Array:
         """Return the torques to send at N queries, given tau and share of `many`, (N, n) each (eq. 26).
@@ -306,8 +376,9 @@ class Evaluator:
         std: Array,
         covariance: Array,
         share: Array,
+        still: Array | None = None,
     ) -> bool:
-        """Compute N queries. moving: their motion for friction and payload."""
+        """Compute N queries. moving: their motion for friction and payload; still: motion to subtract gravity of."""
         count = len(motions)
         blocks, features, prior = scratch.blocks[:count], scratch.features[:count], scratch.prior[:, :count]
         if self._cross is not None:
@@ -316,6 +387,10 @@ class Evaluator:
             self._residual[1].fill_all(motions, features, self._residual[0], prior[0], prior[1])
         for first, fill_many, moves in self._fills_many:
             fill_many(moving if moves else motions, features, first)
+        if still is not None:
+            for each in self._gravity:
+                each.fill_many(still, scratch.gravity[:count], each.first)
+                features[:, each.places] -= scratch.gravity[:count, each.places]
         doubtful = answer(
             self._fixed,
             self._outputs,
@@ -340,6 +415,14 @@ class Evaluator:
         if self._residual is not None:
             tau += prior[0]
         return doubtful
+
+
+def _gravity_places(kernel: LinearKernel, first: int, last: int) -> slice | Indices | None:
+    """Return the places of a term's features that contain gravity, among those of all linear terms; None if none do."""
+    if isinstance(kernel, DriveKernel):
+        gains = first + np.flatnonzero(kernel.gains)
+        return gains if len(gains) else None
+    return None if isinstance(kernel, ResidualKernel | MixtureKernel) else slice(first, last)
 
 
 def _linear_prior(linear: Sequence[LinearKernel], params: Params) -> tuple[Array, Array]:

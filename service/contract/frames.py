@@ -95,7 +95,8 @@ Query parameters of the address:
     rich=1        answer from all centres of a correction
     without_gravity=1
                   return the torque minus gravity in every answer, with the standard deviation of the difference, for
-                  robots that add gravity. It takes about 1 ms longer. External torque and learning are unchanged
+                  robots that add gravity. It takes about 1 ms longer with a term `lip`, else microseconds.
+                  External torque and learning are unchanged
     stream_id     stream to learn from: up to 64 letters, digits, dots, underscores and hyphens, a letter or digit first
 
 Flow control. The service stops reading while an answer waits to be written. A client that sends but does not read is

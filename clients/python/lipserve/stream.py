@@ -165,7 +165,7 @@ class StreamClient(_Stream):
         payload: Request the estimated payload with every answer.
         rich: Answer from all centres of a correction (`rigid-body+local`), which takes longer.
         without_gravity: Return torques minus gravity, with the standard deviation of the difference, for robots that
-            add gravity. It takes about 1 ms longer.
+            add gravity.
 
     Raises:
         StreamError: The service cannot be reached or refuses the stream.

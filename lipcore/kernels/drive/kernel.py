@@ -142,14 +142,14 @@ class DriveKernel(LinearKernel):
 
     def friction(self) -> PartialKernel:
         """Return the part that is friction."""
-        return PartialKernel(self, ~self._gains)
+        return PartialKernel(self, ~self.gains)
 
     def gain(self) -> PartialKernel:
         """Return the part by which torque reads too high or too low."""
-        return PartialKernel(self, self._gains)
+        return PartialKernel(self, self.gains)
 
     @property
-    def _gains(self) -> NDArray[np.bool_]:
+    def gains(self) -> NDArray[np.bool_]:
         """Mask of the weights of the gain, (f n,)."""
         return np.tile([term == "gain" for term in self.drive.terms], self.n_joints)
 

@@ -277,15 +277,17 @@ class Session(Conversation):
             if asked & frames.ASK_LEARN:
                 await self._admit(sequence, asked)
             compares = asked >= frames.ASK_EXTERNAL
-            tau, std, covariance, fallback = self._answer(motion, self._sends_std or asked != 0, compares)
+            reduced = np.empty((2, n)) if self._fills_reduced else None
+            tau, std, covariance, fallback = self._answer(motion, self._sends_std or asked != 0, compares, reduced)
             check_answer("tau", tau)
             if std is not None:
                 check_answer("tau_std", std)
-            factor, more = self._served.scales.of(self._stream_id), b""
+            factor = self._served.scales.of(self._stream_id)
             mean = tau if fallback is None else fallback.mean  # posterior mean for learning and external torque
-            reduced = await self._reduced(motion, tau - mean) if self._without_gravity else None
-            if compares:
-                more = self._external(data, mean, std, covariance, factor)
+            if self._without_gravity:
+                reduced = await self._reduced(motion, tau - mean) if reduced is None else reduced
+                check_answer("tau_without_gravity", reduced)
+            more = self._external(data, mean, std, covariance, factor) if compares else b""
         except ServiceError as error:
             return self._refuse(sequence, flags, arrived, error)
         except Exception as error:  # later frames may succeed
@@ -318,15 +320,16 @@ class Session(Conversation):
         await self._learning.admit(sequence)
 
     async def _reduced(self, motion: Array, more: Array) -> Array:
-        """Return the torque minus gravity, and its standard deviation, (2, n). more: what the answer adds, (n,)."""
+        """Return the torque minus gravity, and its standard deviation, (2, n), of a model with a nonlinear term.
+
+        more: difference of the torque to send from the posterior mean, (n,).
+        """
         model = self._payload_model or self._served.model
         found = await to_thread.run_sync(
             dynamics.components, model, Motion.of(motion[None].copy()), ["without_gravity"]
         )
         estimate = found["without_gravity"]
-        reduced = np.stack([estimate.mean[0] + more, estimate.std[0]])
-        check_answer("tau_without_gravity", reduced)
-        return reduced
+        return np.stack([estimate.mean[0] + more, estimate.std[0]])
 
     def _external(self, data: bytes, mean: Array, std: Array | None, covariance: Array | None, factor: Array) -> bytes:
         """Return the bytes of the external torque of a frame; raise InvalidRequestError."""
@@ -417,3 +420,4 @@ class Session(Conversation):
         self._payload_model = self._payloads.model_for(self._stream_id)
         model = self._payload_model or self._served.model
         self._answer = (model if self._rich else model.fast).answer_fully
+        self._fills_reduced = self._without_gravity and model.separates_gravity

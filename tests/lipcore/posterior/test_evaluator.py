@@ -201,6 +201,31 @@ def test_single_query_gives_identical_bits(evaluator_case: Case) -> None:
         assert_close(own[0], between[k])
 
 
+@pytest.mark.parametrize("name", [name for name in CASES if "rigid" in name and "chain" not in name])
+def test_torque_without_gravity_has_the_covariance_of_the_difference(name: str) -> None:
+    """The features of the difference, from the formulas of the array API, times the dense posterior of the weights."""
+    made = CASES[name]()
+    query, n, evaluator = made.query, made.query.n_joints, made.evaluator()
+    rest, rows, centres = Motion(query.q, *np.zeros((2, *query.q.shape))), [], []
+    for kernel in made.linear:
+        held = np.array(kernel.formula(rest))
+        if isinstance(kernel, DriveKernel):
+            held[[term != "gain" for term in kernel.drive.terms] * n] = 0.0
+        rows.append(np.array(kernel.formula(query)) - held)
+        centre = kernel.prior_weights()
+        centres.append(np.zeros(len(held)) if centre is None else centre)
+    variance = np.concatenate([kernel.variances(made.params) for kernel in made.linear])
+    mean, difference = np.concatenate(centres) + variance * made.weights, np.concatenate(rows)
+    tau, std = evaluator.without_gravity(query.arrays())
+    assert_close(tau, np.einsum("p,pjk->kj", mean, difference))
+    assert_close(std, STD_FACTOR * np.linalg.norm(np.tensordot(made.root * variance, difference, 1), axis=0).T)
+    for row, motion in enumerate(query.arrays()):
+        reduced, plain = np.empty((2, n)), evaluator.one(motion)
+        again = evaluator.one(motion, reduced=reduced)
+        np.testing.assert_array_equal(reduced, [tau[row], std[row]])
+        np.testing.assert_array_equal(again[:2], plain[:2])
+
+
 @pytest.mark.parametrize("mixed", [False, True], ids=["own rows", "rows of others"])
 def test_root_of_a_part_has_the_same_squares(mixed: bool) -> None:
     root = np.tril(np.random.default_rng(0).normal(size=(9, 9)))

@@ -174,7 +174,7 @@ struct Options {
   bool scale = false;               // request the factor on intervals with every answer
   bool payload = false;             // request the estimated payload with every answer
   bool rich = false;                // answer from all centres of a correction, which takes longer
-  bool without_gravity = false;     // torques minus gravity, for robots that add it; takes about 1 ms longer
+  bool without_gravity = false;     // torques minus gravity, for robots that add it
   /// Sequence of the first frame. The service remembers the sequences of a stream_id: to continue one, start above the
   /// last sequence sent.
   std::uint32_t first_sequence = 1;

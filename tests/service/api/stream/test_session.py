@@ -34,7 +34,7 @@ class FakeModel:
     def answer(self, motion, std=True):
         return self.factor * motion[0], np.full_like(motion[0], self.factor) if std else None
 
-    def answer_fully(self, motion, std=True, covariance=False):
+    def answer_fully(self, motion, std=True, covariance=False, reduced=None):
         covariance_or_none = self.factor**2 * (0.5 + 0.5 * np.eye(motion.shape[1])) if covariance else None
         return TorqueAnswer(*self.answer(motion, std), covariance_or_none, None)
 
