@@ -19,6 +19,7 @@ from scipy.interpolate import CubicSpline
 
 import lipcore
 from lipcore.data.samples import Array
+from lipcore.export.fitted_arm import fit_arm
 from lipcore.export.mjcf_writer import mjcf_text
 from lipcore.export.simulated_arm import SimulatedArm
 from lipcore.model.parameters import report
@@ -34,7 +35,7 @@ STIFFNESS_RAD_S, DAMPING = 120.0, 1.0
 def exported(model: TorqueModel) -> str:
     """Return the MJCF of a model, joints in the order of the chain."""
     parameters = report(model.posterior, model.estimator, model.joint_names)
-    return mjcf_text(SimulatedArm.of_parameters(parameters, model.joint_names, model.training_range))
+    return mjcf_text(fit_arm(model, SimulatedArm.of_parameters(parameters, model.joint_names, model.training_range)))
 
 
 def place_joints(arm: mujoco.MjModel, names: tuple[str, ...]) -> list[int]:

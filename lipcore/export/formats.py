@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lipcore.export.c_writer import c_files
+from lipcore.export.fitted_arm import fit_arm
 from lipcore.export.mjcf_writer import mjcf_text
 from lipcore.export.origin import ModelOrigin
 from lipcore.export.sheet import Sheet
@@ -31,13 +32,17 @@ class Format:
     """Type of its only file; None for a folder."""
 
 
+def _arm(model: TorqueModel, parameters: Mapping[str, Any]) -> SimulatedArm:
+    return fit_arm(model, SimulatedArm.of_parameters(parameters, model.joint_names, model.training_range))
+
+
 def _write_urdf(model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin) -> dict[str, bytes]:
-    arm = SimulatedArm.of_parameters(parameters, model.joint_names, model.training_range)
+    arm = _arm(model, parameters)
     return {f"{origin.stem}.urdf": urdf_text(arm, origin.stem, Sheet.of(model, arm, origin)).encode()}
 
 
 def _write_mjcf(model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin) -> dict[str, bytes]:
-    arm = SimulatedArm.of_parameters(parameters, model.joint_names, model.training_range)
+    arm = _arm(model, parameters)
     return {f"{origin.stem}.xml": mjcf_text(arm, origin.stem, Sheet.of(model, arm, origin)).encode()}
 
 

@@ -31,6 +31,7 @@ def torque_shortfall(model: TorqueModel, arm: SimulatedArm) -> dict[str, Array]:
     - `bodies`: the difference of the plausible bodies from the learnt ones.
     - `all`: the difference from the model's torque, which does not know the motion before a state.
 
+    Fitted friction replaces a part of the terms that a simulator lacks, so that errors of several terms partly cancel.
     The Coulomb sign is smoothed as in the model: at standstill a simulator's friction takes any value in between.
     Raise ValueError for an estimator without rigid bodies.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.robots.urdf import PARAMETERS
@@ -41,14 +42,24 @@ def nearest_solid(body: Array, least: float) -> Array:
     return np.concatenate([body[:4], inertia[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]])
 
 
-def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: Array | None = None) -> Array:
+def nearest_plausible(
+    mean: Array,
+    scale: Array,
+    metric: Array,
+    n: int,
+    start: Array | None = None,
+    positive: NDArray[np.int64] | None = None,
+    last: float = 1e-3,
+) -> Array:
     """Return the weights (p,) nearest to a mean (p,) that describe plausible bodies in their first 10 n elements.
 
     metric: (p, p), of weights in units of `scale` (p,). This is a convex problem: ½ |w − μ|² in that metric, subject to
     each body's pseudo-inertia being at least that of a tiny real one. Newton's method follows the central path of a
     barrier, −t Σ log det, as in Boyd & Vandenberghe, § 11. start: (n, 10), a plausible guess; balls replace bodies that
-    cannot exist.
+    cannot exist. positive: places of weights that cannot be negative, such as rotors and friction. last:
+    barrier, after which at most 4 n times its value of the squared distance remain.
     """
+    signed = np.zeros(0, np.int64) if positive is None else positive
     size = PARAMETERS * n
     given = np.zeros((n, PARAMETERS)) if start is None else start
     total = max(float(mean[:size:PARAMETERS].sum()), float(given[:, 0].sum()), 1e-3)
@@ -65,13 +76,15 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
         signs, logs = np.linalg.slogdet(matrices(point))
         if (signs <= 0).any() or (np.linalg.eigvalsh(matrices(point))[:, 0] <= 0).any():
             return np.inf
+        if (point[signed] <= 0).any():
+            return np.inf
         off = point - centre
-        return float(0.5 * off @ metric @ off - barrier * logs.sum())
+        return float(0.5 * off @ metric @ off - barrier * (logs.sum() + np.log(point[signed]).sum()))
 
     point = centre.copy()
     point[:size] = np.concatenate([_replace_impossible(body, total / n, least) for body in given]) / scale[:size]
-    # after the last barrier, at most 4 n times its value of the squared distance remain
-    for barrier in [10.0**power for power in range(3, -4, -1)]:
+    point[signed] = np.maximum(point[signed], 1e-3)
+    for barrier in 10.0 ** np.arange(3, np.log10(last) - 0.5, -1):
         for _ in range(30):
             inverse = np.linalg.inv(matrices(point))
             turned = np.einsum("nij,kjl->nkil", inverse, basis)  # P⁻¹ E_k
@@ -79,10 +92,12 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
             bend = np.einsum("nkij,nlji->nkl", turned, turned)
             gradient = metric @ (point - centre)
             gradient[:size] -= barrier * slope
+            gradient[signed] -= barrier / point[signed]
             hessian = metric.copy()
             for body in range(n):
                 part = slice(PARAMETERS * body, PARAMETERS * (body + 1))
                 hessian[part, part] += barrier * bend[body] * np.outer(scale[part], scale[part])
+            hessian[signed, signed] += barrier / point[signed] ** 2
             try:
                 step = -np.linalg.solve(hessian, gradient)
             except np.linalg.LinAlgError:  # the point is at the boundary to rounding, and still plausible
