@@ -33,8 +33,8 @@ RIDGE = 1e-2
 errors of 10 % of the torque. On nine models of real and simulated arms, 1e-3 had the same errors, and larger masses."""
 MIN_SHARE = 0.01
 """Min torque of a joint relative to the largest one: smaller errors do not matter."""
-BARRIER = 1e-8
-"""Last barrier, in squared errors relative to the torque. A coefficient that wants to be zero becomes about 1e-5 of its
+BARRIER = 1e-5
+"""Last barrier, in squared errors relative to the torque. A coefficient that wants to be zero becomes about 1e-4 of its
 scale."""
 
 
