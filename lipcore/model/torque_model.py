@@ -17,6 +17,7 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.drive.play import ELEMENTS, PlayFollower, PlayState, element_widths, with_deflections
 from lipcore.kernels.drive.terms import SIGN_WIDTH
+from lipcore.kernels.geometry import Geometry
 from lipcore.model import external
 from lipcore.model.selection import Selection
 from lipcore.posterior.compact import CompactPosterior
@@ -158,6 +159,15 @@ class TorqueModel:
         """The learnt rigid bodies, if the estimator has them."""
         term = self.estimator.terms.get("rigid_body")
         return term.arm if isinstance(term, ArmKernel) else None
+
+    @cached_property
+    def geometry(self) -> Geometry | None:
+        """The arm's geometry, as learnt if training moved it from that of the URDF; None without rigid bodies."""
+        if self.arm is None or self.arm.mode == "fixed":
+            return None if self.arm is None else self.arm.geometry
+        basis = self.posterior.basis
+        term = next(each for each in basis.linear if isinstance(each, ArmKernel))
+        return term.geometry(self.posterior.slopes[basis.rows(term)])
 
     def position_limits(self, largest: float) -> Array:
         """Return the max |q| of each joint for values in SI units, (n,) rad (m).

@@ -26,10 +26,10 @@ class NoWrenchError(ValueError):
 
 @dataclass(frozen=True)
 class Wrench:
-    """Force, N, and moment about the origin of the last link's frame, N·m, that act on the arm: (6,) each."""
+    """Force, N, and moment about the origin of the last link or tool, N·m, that act on the arm: (6,) each."""
 
     link: Array
-    """In the axes of the last link, those of payloads."""
+    """In the axes of the last link, those of payloads, or in those of the tool."""
     base: Array
     """In the axes of the base."""
     link_covariance: Array
@@ -53,7 +53,9 @@ def has_wrench(model: TorqueModel) -> bool:
     return model.arm is not None and model.arm.mode != "learn" and model.n_joints >= 6
 
 
-def external_wrench(model: TorqueModel, motion: Array, tau: Array, scale: Array | None = None) -> Wrench:
+def external_wrench(
+    model: TorqueModel, motion: Array, tau: Array, scale: Array | None = None, tool: Array | None = None
+) -> Wrench:
     """Return the wrench at the last link that explains a measured torque.
 
     Its covariance is that of the torque without contact, C = S (K + Σ) S as in `external`.
@@ -63,6 +65,7 @@ def external_wrench(model: TorqueModel, motion: Array, tau: Array, scale: Array 
         motion: q, dq and ddq, (3, n).
         tau: Measured torque, (n,) N·m.
         scale: Factor on the half width of intervals, (n,). Default: that of the model.
+        tool: Pose of the tool's frame in the last link's, (4, 4), m. Default: the last link's own frame.
 
     Raises:
         NoWrenchError: The geometry is learnt, the arm has less than 6 joints, or the posture is singular.
@@ -70,8 +73,8 @@ def external_wrench(model: TorqueModel, motion: Array, tau: Array, scale: Array 
     Example:
         >>> external_wrench(model, motion, tau).base_std
     """
-    arm = model.arm
-    if arm is None or arm.mode == "learn":
+    arm, geometry = model.arm, model.geometry
+    if arm is None or geometry is None or arm.mode == "learn":
         raise NoWrenchError(
             "the geometry of this model is learnt from torque, which does not determine where its links are. Train "
             "with a URDF and the option geometry fixed or calibrate"
@@ -81,17 +84,17 @@ def external_wrench(model: TorqueModel, motion: Array, tau: Array, scale: Array 
     factor = model.scale if scale is None else scale
     covariance = factor[:, None] * (answer.covariance + np.diag(np.square(model.noise_std))) * factor
     order = arm.order
-    return wrench_of(arm.geometry, motion[0][order], (tau - answer.mean)[order], covariance[np.ix_(order, order)])
+    return wrench_of(geometry, motion[0][order], (tau - answer.mean)[order], covariance[np.ix_(order, order)], tool)
 
 
-def wrench_of(geometry: Geometry, q: Array, torque: Array, covariance: Array) -> Wrench:
+def wrench_of(geometry: Geometry, q: Array, torque: Array, covariance: Array, tool: Array | None = None) -> Wrench:
     """Return the wrench of an external torque (n,) N·m with this covariance, (n, n). Joints from base to tip.
 
     Raise NoWrenchError for less than 6 joints or a singular posture.
     """
     if geometry.n_joints < 6:
         raise NoWrenchError(f"the arm has {geometry.n_joints} joints; six components of a wrench need at least 6")
-    jacobian, turn = jacobian_of(geometry, q)
+    jacobian, turn = jacobian_of(geometry, q, tool)
     reach = np.linalg.norm(geometry.translation, axis=1).sum()
     sizes = np.linalg.svd(jacobian / np.repeat([reach, 1.0], 3)[:, None], compute_uv=False)
     if sizes[-1] < SINGULAR_RATIO * sizes[0]:
@@ -107,13 +110,15 @@ def wrench_of(geometry: Geometry, q: Array, torque: Array, covariance: Array) ->
     return Wrench(into @ base, base, into @ found @ into.T, found)
 
 
-def jacobian_of(geometry: Geometry, q: Array) -> tuple[Array, Array]:
+def jacobian_of(geometry: Geometry, q: Array, tool: Array | None = None) -> tuple[Array, Array]:
     """Return the Jacobian (6, n) of the last link's origin in the axes of the base, linear first; and its axes, (3, 3).
 
-    q: (n,), base to tip.
+    q: (n,), base to tip; tool: pose of another frame in the last link, (4, 4), which then replaces the last link's.
     """
     turns, places = geometry.placements(q)
+    pose = np.eye(4) if tool is None else tool
+    tip = places[-1] + turns[-1] @ pose[:3, 3]
     axes = (turns @ geometry.axis[..., None])[..., 0]
     slides = np.array([kind == "prismatic" for kind in geometry.joint_types])[:, None]
-    linear = np.where(slides, axes, np.cross(axes, places[-1] - places))
-    return np.concatenate([linear, np.where(slides, 0.0, axes)], axis=1).T, turns[-1]
+    linear = np.where(slides, axes, np.cross(axes, tip - places))
+    return np.concatenate([linear, np.where(slides, 0.0, axes)], axis=1).T, turns[-1] @ pose[:3, :3]

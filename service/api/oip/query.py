@@ -33,7 +33,12 @@ ARM_OUTPUTS = {"tau_external_statistic": "statistic", "tau_external_p": "p"}
 """External torque outputs with one number per query. They need the covariance."""
 EXTERNAL_OUTPUTS = {"tau_external": "tau", "tau_external_std": "std", "tau_external_z": "z"} | ARM_OUTPUTS
 """External torque outputs, and the property of `External` that they return."""
-WRENCH_OUTPUTS = {f"wrench_{part}{end}": f"{part}{end}" for part in ("link", "base") for end in ("", "_std")}
+WRENCH_OUTPUTS = {
+    "wrench_link": "link",
+    "wrench_link_std": "link_std",
+    "wrench_base": "base",
+    "wrench_base_std": "base_std",
+}
 """Outputs with six numbers per query, of models with the geometry of a URDF, and the property of `Wrench`."""
 FALLBACK = "fallback"
 """Output with the share of the fallback in `tau`."""

@@ -8,6 +8,8 @@ import pytest
 
 from lipcore import load
 from lipcore.estimators.catalogue import make_estimator
+from lipcore.kernels.arm import ArmKernel
+from lipcore.model.parameters import weight_posterior
 from lipcore.model.wrench import NoWrenchError, external_wrench, jacobian_of, wrench_of
 from tests import ROOT
 from tests.lipcore.arm_oracles import arm
@@ -43,6 +45,46 @@ def test_wrench_is_the_force_on_the_last_link(kinds: str) -> None:
         np.testing.assert_allclose(seen.link_covariance @ precision, np.eye(6), atol=1e-6)
         np.testing.assert_allclose(seen.base_std**2, (local.T @ seen.link_covariance @ local).diagonal(), rtol=1e-6)
     assert found > 5
+
+
+def test_wrench_at_a_tool_is_that_of_its_frame() -> None:
+    """Pinocchio's Jacobian of a frame, and the same wrench moved from the last link."""
+    geometry, _, robot = arm("RRRRRR", 50)
+    place = pin.SE3(pin.utils.rotate("x", 0.7) @ pin.utils.rotate("z", -0.4), np.array([0.1, -0.05, 0.2]))
+    frame = robot.model.addFrame(pin.Frame("tool", 6, place, pin.FrameType.OP_FRAME))
+    q = np.array([0.3, -0.8, 1.1, 0.4, -0.9, 0.2])
+    expected = pin.computeFrameJacobian(robot.model, robot.model.createData(), q, frame, pin.ReferenceFrame.LOCAL)
+    jacobian, turn = jacobian_of(geometry, q, place.homogeneous)
+    np.testing.assert_allclose(np.kron(np.eye(2), turn.T) @ jacobian, expected, atol=1e-12)
+    torque, covariance = np.arange(1.0, 7.0), np.diag(np.arange(1.0, 7.0))
+    link, tool = (
+        wrench_of(geometry, q, torque, covariance),
+        wrench_of(geometry, q, torque, covariance, place.homogeneous),
+    )
+    np.testing.assert_allclose(tool.link, place.actInv(pin.Force(link.link)).vector, rtol=1e-8)
+    action = place.inverse().toDualActionMatrix()
+    np.testing.assert_allclose(tool.link_covariance, action @ link.link_covariance @ action.T, rtol=1e-6, atol=1e-12)
+
+
+def test_calibrated_geometry_is_the_learnt_one() -> None:
+    learnt = load(ROOT / "models/panda-sim")
+    known = learnt.arm
+    assert known is not None
+    assert known.mode == "learn"
+    term = learnt.estimator.terms["rigid_body"]
+    assert isinstance(term, ArmKernel)
+    expected = term.geometry(weight_posterior(learnt.posterior, term).mean)
+    assert learnt.geometry is not None
+    np.testing.assert_allclose(learnt.geometry.translation, expected.translation, atol=1e-9)
+    assert np.abs(expected.translation - known.geometry.translation).max() > 1e-6
+    estimator = make_estimator("rigid-body", learnt.joint_types, arm=replace(known, mode="calibrate"))
+    model = replace(learnt, estimator=estimator)
+    tau = model.answer(MOTION)[0]
+    base = np.array([10.0, 0.0, -5.0, 0.0, 0.5, 0.0])
+    jacobian, _ = jacobian_of(expected, MOTION[0][known.order])
+    pushed = tau.copy()
+    pushed[known.order] -= jacobian.T @ base
+    np.testing.assert_allclose(external_wrench(model, MOTION, pushed).base, base, atol=1e-7)
 
 
 def test_singular_posture_and_short_arm_are_named() -> None:
