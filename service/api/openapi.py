@@ -139,7 +139,7 @@ def _add(path: str, method: str, operation: dict[str, Any], rules: Rules) -> Non
         kinds += (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
     # these POST routes store nothing
     if method != "get" and not path.endswith(
-        ("/predict", "/gravity", "/evaluate", "/trace", "/compare", "/echo", "/infer")
+        ("/predict", "/gravity", "/wrench", "/evaluate", "/trace", "/compare", "/echo", "/infer")
     ):
         kinds += (errors.StorageFullError,)
     protocol = f"{path}/".startswith(f"{OPEN_INFERENCE}/")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from lipserve.asynchronous import AsyncClient
     from lipserve.exchange import StreamError
     from lipserve.results.evaluation import Comparison, Evaluation
-    from lipserve.results.series import Component, LiveRows, Prediction, Preview, Trace
+    from lipserve.results.series import Component, LiveRows, Prediction, Preview, Trace, Wrench
     from lipserve.sending import ApiError, ServiceUnreachableError
     from lipserve.stream import AsyncStreamClient, StreamClient
     from lipserve.sync import Client
@@ -45,6 +45,7 @@ _HOMES = {
     "StreamClient": "stream",
     "StreamError": "exchange",
     "Trace": "results.series",
+    "Wrench": "results.series",
     "read_alarm_event": "alarms",
 }
 """Module of each exported name. Names are imported on first use: the service imports modules of this package."""
@@ -66,6 +67,7 @@ __all__ = [
     "StreamClient",
     "StreamError",
     "Trace",
+    "Wrench",
     "__version__",
     "read_alarm_event",
 ]

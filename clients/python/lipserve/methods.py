@@ -125,6 +125,7 @@ class Calls:
 
     predict = One(calls.inference.predict)
     gravity = One(calls.inference.gravity)
+    wrench = One(calls.inference.wrench)
     evaluate = One(calls.inference.evaluate)
     compare = One(calls.inference.compare)
     trace = One(calls.inference.trace)

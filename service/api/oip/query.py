@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lipcore.data.motion import Motion
 from lipcore.model.external import external
 from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePrediction
-from lipcore.model.wrench import NoWrenchError, external_wrench, has_wrench
+from lipcore.model.wrench import has_wrench
 from lipcore.vocabulary import COMPONENTS, ComponentName, offered_components
 from service.api.oip import schema
 from service.api.oip.sequences import Sequences, read_part
@@ -21,6 +21,7 @@ from service.api.route import Reply
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import FORWARD, QUANTITIES, Query, check_answer, check_count, check_torque
+from service.inference.wrench import wrenches
 from service.models.loaded import ServedModel
 
 Array = NDArray[np.float64]
@@ -236,15 +237,8 @@ def _wrenches(model: TorqueModel, task: InferTask, scale: Array, names: frozense
     """Return the named parts of the wrench, (N, 6); raise InvalidRequestError for a singular posture."""
     if not names:
         return {}
-    q, dq, ddq, measured = task.query.values
-    motion, found = Motion(q, dq, ddq, task.deflections).arrays(), []
-    for row, tau in enumerate(measured):
-        try:
-            found.append(external_wrench(model, motion[row], tau, scale))
-        except NoWrenchError as error:
-            field = "q" if task.query.single else f"q[{row}]"
-            message = f"At `{field}`, {error}."
-            raise invalid_request(field, "a singular posture", "a posture away from singular ones", message) from error
+    q, dq, ddq, _ = task.query.values
+    found = wrenches(model, task.query, Motion(q, dq, ddq, task.deflections).arrays(), scale)
     return {name: np.stack([getattr(each, WRENCH_OUTPUTS[name]) for each in found]) for name in names}
 
 

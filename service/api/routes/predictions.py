@@ -14,6 +14,7 @@ from service.api.dependencies import LoadedModelsDep, PredictionsDep
 from service.api.errors import responses
 from service.api.route import JSON, OCTETS, Reply, Route, hot_route, is_json, media_type
 from service.contract import predictions as schema
+from service.contract.wrench import WrenchRequest, WrenchResponse
 from service.foundation.errors import (
     DamagedDataError,
     InvalidRequestError,
@@ -25,6 +26,7 @@ from service.foundation.errors import (
 from service.inference import comparison, evaluating, predicting
 from service.inference.gravity import gravity as gravity_torque
 from service.inference.predicting import encode, one_motion, queries
+from service.inference.wrench import wrench as external_wrench
 from service.models.loaded import LoadedModels
 from service.models.served import ServedModel, wait_for_revision
 
@@ -106,7 +108,9 @@ async def _in_thread(
 
 
 async def _revised(
-    loaded: LoadedModels, model: str, request: schema.PredictRequest | schema.GravityRequest | schema.EvaluateRequest
+    loaded: LoadedModels,
+    model: str,
+    request: schema.PredictRequest | schema.GravityRequest | WrenchRequest | schema.EvaluateRequest,
 ) -> ServedModel | None:
     """Wait for the revision that a request asks for and return its version, None if it asks for none."""
     if request.min_revision is None:
@@ -149,6 +153,18 @@ async def gravity(
     """
     served = await _revised(loaded, model, request)
     return await to_thread.run_sync(gravity_torque, loaded, model, request, served, limiter=turns)
+
+
+@router.post("/{model}/wrench", summary="Return the external wrench", responses=_LATE)
+@needs(PREDICT)
+async def wrench(loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: WrenchRequest) -> WrenchResponse:
+    """Return the force and moment on the last link or a tool that explain a measured torque, with their covariance.
+
+    Only for models with the geometry of a URDF (`fixed` or `calibrate`) and at least 6 joints. It is not a safety
+    function. Friction does not follow the motion before a state.
+    """
+    served = await _revised(loaded, model, request)
+    return await to_thread.run_sync(external_wrench, loaded, model, request, served, limiter=turns)
 
 
 @router.post("/{model}/evaluate", summary="Evaluate a model on a data set", responses=_LATE)

@@ -86,7 +86,7 @@ def test_common_errors_are_documented_at_every_route(operations):
         assert ("401" in answered) != name.endswith(("/health", "/health/live", "/health/ready")), name
         assert ("requestBody" in operation) == ("408" in answered) == ("413" in answered) == ("415" in answered), name
         stores = not name.startswith("GET") and not name.endswith(
-            ("/predict", "/gravity", "/evaluate", "/trace", "/compare", "/echo", "/infer")
+            ("/predict", "/gravity", "/wrench", "/evaluate", "/trace", "/compare", "/echo", "/infer")
         )
         assert ("507" in answered) == stores, name
 

@@ -25,6 +25,7 @@ REASONS = {
     "GET /v1/models/{model}/live": "does not end, for pages: `lipserve open MODEL --live` tells their address",
     "POST /v1/models/{model}/observations": "batches of programs; `lipserve stream` teaches from the shell",
     "POST /v1/models/{model}/gravity": "`predict --components gravity` prints it",
+    "POST /v1/models/{model}/wrench": "for programs that measure torque",
     "POST /v1/echo": "measures what transport costs, for clients and benchmarks",
     "GET /v1/jobs/{job}/events": "for pages; `jobs follow` asks for the job again and again",
     "GET /health/live": "for what watches over the service",

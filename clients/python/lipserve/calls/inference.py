@@ -22,7 +22,16 @@ from lipserve.records.server import (
 )
 from lipserve.results import Array, array
 from lipserve.results.evaluation import Comparison, Evaluation, read_comparison, read_evaluation
-from lipserve.results.series import Component, Prediction, Trace, read_component, read_prediction, read_trace
+from lipserve.results.series import (
+    Component,
+    Prediction,
+    Trace,
+    Wrench,
+    read_component,
+    read_prediction,
+    read_trace,
+    read_wrench,
+)
 
 
 @route("POST", "/v1/models/{model}/predict", repeatable=True)
@@ -121,6 +130,54 @@ def gravity(
     name, which = split_name(model, version, alias)
     body |= which | given(min_revision=min_revision)
     return _route(read_component, names={"model": name}, json=body)
+
+
+@route("POST", "/v1/models/{model}/wrench", repeatable=True)
+def wrench(
+    _route: Route,
+    model: str,
+    q: ArrayLike,
+    dq: ArrayLike,
+    ddq: ArrayLike,
+    tau: ArrayLike,
+    tool: ArrayLike | None = None,
+    version: int | None = None,
+    alias: str | None = None,
+    min_revision: int | None = None,
+    payload: Mapping[str, ArrayLike] | None = None,
+) -> Call[Wrench]:
+    """Return the force and moment on the last link that explain a measured torque, at one or N motions.
+
+    It is not a safety function.
+
+    Args:
+        model: Name of the model, also as `NAME@3` or `NAME@ALIAS`. It needs the geometry of a URDF.
+        q: (n,) or (N, n) positions, rad (prismatic: m).
+        dq: Velocities, same shape, rad/s (m/s).
+        ddq: Accelerations, same shape, rad/s² (m/s²).
+        tau: Measured torque, same shape, N·m (N).
+        tool: Pose of the tool's frame in the last link's, (4, 4), m. Default: the last link's own frame.
+        version: Version number. Default: the serving version.
+        alias: Alias of the version, instead of its number.
+        min_revision: Min revision of the answer; see `predict`.
+        payload: As in `predict`.
+
+    Returns:
+        Force and moment in the axes of the last link or tool and of the base, with their covariances.
+
+    Raises:
+        ApiError: The model has no such geometry, or the posture is singular.
+
+    Example:
+        >>> client.wrench("my-ur10", q, dq, ddq, tau).base
+    """
+    values = {"q": q, "dq": dq, "ddq": ddq, "tau": tau} | given(tool=tool)
+    body: dict[str, Any] = {name: np.asarray(each, dtype=np.float64).tolist() for name, each in values.items()}
+    if payload is not None:
+        body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
+    name, which = split_name(model, version, alias)
+    body |= which | given(min_revision=min_revision)
+    return _route(read_wrench, names={"model": name}, json=body)
 
 
 @route("POST", "/v1/models/{model}/evaluate", repeatable=True)

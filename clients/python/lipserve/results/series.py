@@ -52,6 +52,35 @@ class Component(Plain):
 
 
 @dataclass(frozen=True, eq=False)
+class Wrench(Plain):
+    """Force, N, and moment about the origin of the last link or tool, N·m, that act on the arm, at one or N motions.
+
+    Example:
+        >>> answer = client.wrench("my-ur10", q, dq, ddq, tau)
+        >>> answer.base, answer.base_std
+    """
+
+    link: Array
+    """(6,) or (N, 6), in the axes of the last link or tool."""
+    link_covariance: Array
+    """(6, 6) or (N, 6, 6)."""
+    base: Array
+    """In the axes of the base."""
+    base_covariance: Array
+    """(6, 6) or (N, 6, 6)."""
+
+    @property
+    def link_std(self) -> Array:
+        """Standard deviations in the axes of the last link or tool, (6,) or (N, 6)."""
+        return np.sqrt(np.diagonal(self.link_covariance, axis1=-2, axis2=-1))
+
+    @property
+    def base_std(self) -> Array:
+        """Standard deviations in the axes of the base, (6,) or (N, 6)."""
+        return np.sqrt(np.diagonal(self.base_covariance, axis1=-2, axis2=-1))
+
+
+@dataclass(frozen=True, eq=False)
 class Prediction(Plain):
     """Predicted torques at one motion, (n,), or N motions, (N, n).
 
@@ -105,6 +134,7 @@ class Prediction(Plain):
 
 
 read_component = reading(Component)
+read_wrench = reading(Wrench)
 read_prediction = reading(Prediction)
 
 
