@@ -1,7 +1,7 @@
 """A model of rigid bodies as C99 for hard real time: source and header, from the templates in `lipcore/export/c`.
 
 Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean is written without features,
-as one recursion over the bodies and their change with the learnt step. The standard deviation is |Uᵀ φ_b|, see
+operation by operation, see `c_program`. The standard deviation is |Uᵀ φ_b|, see
 `c_weights`. A nonlinear term adds its covariances with stored torques, see `c_rest`. Each joint's frame is turned so
 that its axis is z. The two vectors across the axis, about which the geometry steps, are x and y.
 """
@@ -20,6 +20,7 @@ import numpy as np
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
+from lipcore.export.c_program import bodies_statements, others_statements
 from lipcore.export.c_rest import NonlinearTerm, correction_tables
 from lipcore.export.c_weights import (
     LinearWeights,
@@ -87,20 +88,18 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
     rubbing = learnt.mean[learnt.arm.size :].reshape(n, -1)
     own = np.concatenate([learnt.mean[size : size + n, None], rubbing], axis=1)[order]
     bodies = learnt.mean[:size].reshape(n, PARAMETERS)[order]
-    table = _arm_table(arm.geometry, learnt.mean[learnt.arm.steps], arm.parameters, bodies - arm.parameters, own)
-    arms, share = "{0}", "{0}"
+    table = _arm_table(arm.geometry, arm.parameters, own)
+    step, change = learnt.mean[learnt.arm.steps], bodies - arm.parameters
+    owns, share, others_written = "{0}", "{0}", ""
     if learnt.arm.others is not None:
-        each = [
-            _arm_table(
-                replace(alone.geometry, gravity=arm.alternatives[0].geometry.gravity),
-                np.zeros(0),
-                alone.parameters,
-                np.zeros_like(alone.parameters),
-                np.concatenate([alone.rotor[:, None], alone.friction], axis=1)[order],
+        gravity = arm.alternatives[0].geometry.gravity
+        each = [(replace(alone.geometry, gravity=gravity), alone.parameters) for alone in arm.alternatives]
+        others_written = others_statements(each)
+        owns = _braced(
+            np.stack(
+                [np.concatenate([alone.rotor[:, None], alone.friction], axis=1)[order] for alone in arm.alternatives]
             )
-            for alone in arm.alternatives
-        ]
-        arms = "{" + ",\n".join(each) + "}"
+        )
         share = _braced(learnt.arm.others.mixing @ learnt.mean[learnt.arm.steps.stop : learnt.arm.size])
     padded = [[*names, *[0] * (7 - len(names))] for names in kept]
     counts = [len(names) for names in kept]
@@ -139,7 +138,9 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "accelerated": repr(ACCELERATED),
         "quantile": repr(quantile(LEVEL)),
         "arm": table,
-        "arms": arms,
+        "owns": owns,
+        "written_out": bodies_statements(arm.geometry, step, arm.parameters, change),
+        "others_written_out": others_written,
         "share": share,
         "root": _braced(_panels(root)),
         **_rest(NonlinearTerm.of(posterior), shared),
@@ -185,26 +186,17 @@ def _texts(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
     }
 
 
-def _arm_table(geometry: Geometry, step: Array, bodies: Array, change: Array, own: Array) -> str:
-    """Return the initializer of an `arm_t`.
-
-    step: (g,), empty for a fixed geometry; bodies, change: (n, 10), own: (n, 4 or 5), base to tip.
-    """
+def _arm_table(geometry: Geometry, bodies: Array, own: Array) -> str:
+    """Return the initializer of an `arm_t`. bodies: (n, 10), own: (n, 4 or more), base to tip."""
     n, axes = geometry.n_joints, axes_of(geometry)
     before = np.concatenate([np.eye(3)[None], axes[:-1]])
     turn = before.mT @ geometry.rotation @ axes
     place = (before.mT @ geometry.translation[..., None])[..., 0]
-    tilt, along, at = np.zeros((n, 2)), np.zeros((n, 3)), 0
-    for j, count in enumerate(geometry.screws if len(step) else [0] * n):
-        tilt[j, : min(count, 2)] = step[at : at + min(count, 2)]
-        along[j, : max(count - 2, 0)] = step[at + 2 : at + count]
-        at += count
-    shift = (turn @ along[..., None])[..., 0]
-    turned = [
-        np.stack([move_parameters(axes[j].T, np.zeros(3), each[j]) for j in range(n)]) for each in (bodies, change)
-    ]
-    names = ("gravity", "turn", "place", "tilt", "shift", "body", "change", "own")
-    numbers = (geometry.gravity, turn.reshape(n, 9), place, tilt, shift, *turned, own)
+    turned = np.stack([move_parameters(axes[j].T, np.zeros(3), bodies[j]) for j in range(n)])
+    names, numbers = (
+        ("gravity", "turn", "place", "body", "own"),
+        (geometry.gravity, turn.reshape(n, 9), place, turned, own),
+    )
     fields = [f".{name} = {_braced(value)}" for name, value in zip(names, numbers, strict=True)]
     return "{\n" + ",\n".join(fields) + "}"
 
