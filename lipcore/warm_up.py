@@ -41,6 +41,7 @@ def warm_up(*names: str) -> None:
     for name in names or COMPILED_ESTIMATORS:
         model = train(_swinging(), ("revolute", "revolute"), name, FASTEST_OPTIONS)
         model.warm_up()
+        model.torque(*np.zeros((3, 1, 2)))
         if model.arm is not None:
             _of_arm(model.arm)
 

@@ -20,9 +20,11 @@ from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.geometry import Geometry
 from lipcore.model import external
 from lipcore.model.selection import Selection
+from lipcore.posterior.batch_mean import BatchMean
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.conformal import Conformal
 from lipcore.posterior.evaluator import Evaluator
+from lipcore.posterior.threads import run_parts
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType, TorqueConvention
 
@@ -218,22 +220,50 @@ class TorqueModel:
             ValueError: The number of joints is wrong, the shapes differ, or a value is not finite.
 
         """
-        query = motion_arrays(q, dq, ddq)
-        joints = query[0].shape[1]
-        if joints != self.n_joints:
-            raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
-        if deflections is not None:
-            expected = (len(query[0]), 2 * len(ELEMENTS), joints)
-            if deflections.shape != expected or not np.isfinite(deflections).all():
-                raise ValueError(f"deflections has shape {deflections.shape}, expected finite numbers, {expected}")
-        mean, std, between, share = self.evaluator.many(*query, covariance, deflections)
+        motion = self._checked(q, dq, ddq, deflections)
+        mean, std, between, share = self.evaluator.many(motion.q, motion.dq, motion.ddq, covariance, deflections)
         tau, fallback = mean, None
         if share is not None:
             rows = share.any(axis=1)
             tau, fallback = mean.copy(), Fallback(share, mean)
-            motions = Motion(*query, deflections)[np.flatnonzero(rows)].arrays()
+            motions = motion[np.flatnonzero(rows)].arrays()
             tau[rows] = self.evaluator.fall_back(motions, mean[rows], share[rows])
         return TorquePrediction(tau, std, self.noise_std, self.scale, between, fallback)
+
+    def torque(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, deflections: Array | None = None) -> Array:
+        """Return the mean torque alone at N states, or at one: for planners and simulators with large batches.
+
+        It is `TorquePrediction.mean`, which never falls back, to rounding. Rigid bodies and drive take a tenth of the
+        time of `predict`; other models take as long. Large batches use all processors.
+
+        Args:
+            q: Positions, (n,) or (N, n), rad (m).
+            dq: Velocities, same shape, rad/s (m/s).
+            ddq: Accelerations, same shape, rad/s² (m/s²).
+            deflections: Deflections of the play elements, (N, 2 K, n); see `deflections_along`.
+
+        Returns:
+            Torques, (N, n) N·m (N).
+
+        Raises:
+            ValueError: The number of joints is wrong, the shapes differ, or a value is not finite.
+
+        Example: the efforts of N states.
+
+            np.abs(model.torque(q, dq, ddq)).sum(axis=1)
+
+        """
+        motion = self._checked(q, dq, ddq, deflections)
+        batch = self._batch_mean
+        if batch is None:
+            return self.evaluator.many(motion.q, motion.dq, motion.ddq, False, deflections)[0]
+        out = np.empty(motion.q.shape)
+
+        def run_part(rows: slice) -> None:
+            out[rows] = batch(motion[rows])
+
+        run_parts(len(motion), run_part)
+        return out
 
     def predict_along(self, samples: Samples, covariance: bool = False) -> TorquePrediction:
         """Return the torque along recordings: rows are in order of time in each episode, and friction follows them.
@@ -310,6 +340,23 @@ class TorqueModel:
         model = replace(self)
         model.__dict__["evaluator"] = self.evaluator.fast()  # fill the cached property
         return model
+
+    def _checked(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, deflections: Array | None) -> Motion:
+        """Return N states; raise ValueError like `predict`."""
+        query = motion_arrays(q, dq, ddq)
+        joints = query[0].shape[1]
+        if joints != self.n_joints:
+            raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
+        if deflections is not None:
+            expected = (len(query[0]), 2 * len(ELEMENTS), joints)
+            if deflections.shape != expected or not np.isfinite(deflections).all():
+                raise ValueError(f"deflections has shape {deflections.shape}, expected finite numbers, {expected}")
+        return Motion(*query, deflections)
+
+    @cached_property
+    def _batch_mean(self) -> BatchMean | None:
+        """The mean of rigid bodies and drive, or None if the model has more terms."""
+        return BatchMean(self.posterior) if BatchMean.applies_to(self.posterior) else None
 
     @cached_property
     def evaluator(self) -> Evaluator:

@@ -32,6 +32,7 @@ from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.misfit import Misfit
+from lipcore.posterior.threads import run_parts
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -290,24 +291,30 @@ class Evaluator:
         """Return torques (N, n), their standard deviations (N, n) and, if requested, covariances (N, n, n).
 
         Fourth, return the shares of the fallback, (N, n), or None if all are zero. q, dq, ddq: (N, n); deflections: as
-        in `Motion`; neither shapes nor finiteness are checked.
+        in `Motion`; neither shapes nor finiteness are checked. Large batches use all processors.
         """
-        scratch, (size, n) = self._many, q.shape
+        size, n = q.shape
         tau, std, share = np.empty((size, n)), np.empty((size, n)), np.empty((size, n))
         covariances = np.empty((size, n, n)) if covariance else None
-        doubtful = False
-        for start in range(0, size, QUERIES):
-            rows = slice(start, min(start + QUERIES, size))
-            count = rows.stop - start
-            motions = (scratch.motions if deflections is None else scratch.deflected)[:count]
-            for part, values in enumerate((q, dq, ddq)):
-                motions[:, part] = values[rows]
-            if deflections is not None:
-                motions[:, POSITIONS:] = deflections[rows]
-            work = scratch.covariance[:count] if covariances is None else covariances[rows]
-            what = STD if covariances is None else COVARIANCE
-            doubtful |= self._answer(scratch, motions, motions, what, tau[rows], std[rows], work, share[rows])
-        return tau, std, covariances, share if doubtful else None
+        doubtful = list[bool]()
+
+        def answer_part(part: slice) -> None:
+            scratch, doubtful_part = self._many, False
+            for start in range(part.start, part.stop, QUERIES):
+                rows = slice(start, min(start + QUERIES, part.stop))
+                count = rows.stop - start
+                motions = (scratch.motions if deflections is None else scratch.deflected)[:count]
+                for place, values in enumerate((q, dq, ddq)):
+                    motions[:, place] = values[rows]
+                if deflections is not None:
+                    motions[:, POSITIONS:] = deflections[rows]
+                work = scratch.covariance[:count] if covariances is None else covariances[rows]
+                what = STD if covariances is None else COVARIANCE
+                doubtful_part |= self._answer(scratch, motions, motions, what, tau[rows], std[rows], work, share[rows])
+            doubtful.append(doubtful_part)
+
+        run_parts(size, answer_part)
+        return tau, std, covariances, share if any(doubtful) else None
 
     def without_gravity(self, motions: Array) -> tuple[Array, Array]:
         """Return the torques minus gravity at N queries, and the standard deviations of the differences, (N, n) each.

@@ -84,10 +84,13 @@ class Drive:
         """The regressor that computes the terms."""
         return DriveRegressor(self)
 
-    def formula(self, x: Motion) -> Array:
-        """Return each joint's terms at N queries, (f, N, n), in the array API. The arrays of x are of any library."""
-        load = known = None
-        if self.needs_bodies:
+    def formula(self, x: Motion, load: Array | None = None) -> Array:
+        """Return each joint's terms at N queries, (f, N, n), in the array API. The arrays of x are of any library.
+
+        load: (N, n) N·m (N), the torque that the bodies need, if it is known already.
+        """
+        known = None
+        if self.needs_bodies and load is None:
             assert self.bodies is not None
             geometry, order = self.bodies.geometry, self.bodies.order
             chain = rigid_body_torque(geometry, self.bodies.parameters, State.paired(x).ordered(order))
