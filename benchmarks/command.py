@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from benchmarks import batch as batches
 from benchmarks import facts
 from benchmarks.clients import BadAnswerError
 from benchmarks.exported import running as exported_running
@@ -324,6 +325,21 @@ def exported(
     if json_file is not None:
         results.write(json_file, _targets_json(found))
     _report(exported_running.grids(results), [], found, console, markdown, strict)
+
+
+@app.command()
+def batch(
+    folder: Annotated[
+        Path, typer.Option(exists=True, file_okay=False, help="Folder of a saved model.")
+    ] = exported_running.SHIPPED,
+    sizes: Annotated[str, typer.Option(help="States in a batch, separated by commas.")] = "1,100,10000,100000",
+    repetitions: Annotated[int, typer.Option(min=1, help="Repetitions; the best counts.")] = 10,
+    markdown: Markdown = None,
+) -> None:
+    """Time large batches in process, beside Pinocchio in a Python loop."""
+    console = _begin()
+    results = batches.run(folder, [int(each) for each in sizes.split(",")], repetitions, console)
+    _report(batches.grids(results), [], [], console, markdown, False)
 
 
 @app.command()
