@@ -233,8 +233,8 @@ class TorqueModel:
     def torque(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, deflections: Array | None = None) -> Array:
         """Return the mean torque alone at N states, or at one: for planners and simulators with large batches.
 
-        It is `TorquePrediction.mean`, which never falls back, to rounding. Rigid bodies and drive take a tenth of the
-        time of `predict`; other models take as long. Large batches use all processors.
+        It is `TorquePrediction.mean`, which never falls back, to rounding. Estimators `rigid-body` and
+        `rigid-body+local` take a tenth to a half of the time of `predict`; others as long. Large batches use all processors.
 
         Args:
             q: Positions, (n,) or (N, n), rad (m).
@@ -355,7 +355,7 @@ class TorqueModel:
 
     @cached_property
     def _batch_mean(self) -> BatchMean | None:
-        """The mean of rigid bodies and drive, or None if the model has more terms."""
+        """The mean of rigid bodies, drive and correction, or None if the model has other terms."""
         return BatchMean(self.posterior) if BatchMean.applies_to(self.posterior) else None
 
     @cached_property

@@ -12,7 +12,7 @@ from lipcore.posterior.batch_mean import BatchMean
 from tests.choosing import few
 from tests.lipcore.export.test_c_writer import MODELS, PANDA, draw_motions
 
-KEPT = ("panda", "friction of all kinds, alternatives")
+KEPT = ("panda", "local", "energies", "friction of all kinds, alternatives")
 
 
 @pytest.mark.parametrize("name", few(MODELS, kept=lambda name: name in KEPT))
@@ -25,7 +25,7 @@ def test_mean_alone_is_that_of_the_prediction(name: str) -> None:
         size = np.abs(expected).max()
         np.testing.assert_allclose(model.torque(*motion, known), expected, rtol=0, atol=1e-11 * size)
     assert model.torque(*motion[:, 0]).shape == (1, model.n_joints)
-    assert BatchMean.applies_to(model.posterior) == (model.estimator.name == "rigid-body")
+    assert BatchMean.applies_to(model.posterior) == (model.estimator.name in ("rigid-body", "rigid-body+local"))
 
 
 def test_parts_of_a_batch_equal_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
