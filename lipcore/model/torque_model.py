@@ -234,7 +234,8 @@ class TorqueModel:
         """Return the mean torque alone at N states, or at one: for planners and simulators with large batches.
 
         It is `TorquePrediction.mean`, which never falls back, to rounding. Estimators `rigid-body` and
-        `rigid-body+local` take a tenth to a half of the time of `predict`; others as long. Large batches use all processors.
+        `rigid-body+local` take a tenth to a half of the time of `predict`; others as long. Large batches use all
+        processors.
 
         Args:
             q: Positions, (n,) or (N, n), rad (m).
