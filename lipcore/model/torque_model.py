@@ -29,6 +29,10 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType, TorqueConvention
 
 
+MIN_BATCH = 16
+"""States from which on the mean alone is faster without features, measured on a Panda."""
+
+
 @dataclass(frozen=True)
 class Fallback:
     """Difference of torques from the posterior mean, if the training does not determine them.
@@ -255,7 +259,7 @@ class TorqueModel:
 
         """
         motion = self._checked(q, dq, ddq, deflections)
-        batch = self._batch_mean
+        batch = self._batch_mean if len(motion) >= MIN_BATCH else None
         if batch is None:
             return self.evaluator.many(motion.q, motion.dq, motion.ddq, False, deflections)[0]
         out = np.empty(motion.q.shape)
