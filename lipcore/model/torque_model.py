@@ -28,7 +28,6 @@ from lipcore.posterior.threads import run_parts
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType, TorqueConvention
 
-
 MIN_BATCH = 16
 """States from which on the mean alone is faster without features, measured on a Panda."""
 
