@@ -42,6 +42,8 @@ EXTRAS = {
     "cluster": Extra("share PostgreSQL, S3 and a Dask cluster", ("psycopg", "s3fs", "distributed")),
     "grpc": Extra("serve over gRPC", ("grpc", "google.protobuf")),
     "opentelemetry": Extra("send traces", ("opentelemetry.exporter.otlp.proto.http",)),
+    "onnx": Extra("export ONNX", ("onnx",)),
+    "jax": Extra("export functions of JAX", ("jax",)),
     "plot": Extra("draw pictures", ("matplotlib",)),
 }
 """All extras by name, as in pyproject.toml."""

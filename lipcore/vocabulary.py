@@ -56,7 +56,7 @@ GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
 """How the joint axes of rigid bodies are found: learnt from torque alone, learnt around a URDF or the arm of another
 unit, or fixed as given there."""
 
-ExportFormat = Literal["archive", "urdf", "mjcf", "c"]
+ExportFormat = Literal["archive", "urdf", "mjcf", "c", "onnx", "torch", "jax"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
 """What a version is exported as: an archive for another service, or a format of `lipcore.export.formats`."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,20 @@ from lipcore.model.torque_model import TorqueModel
 
 UNITS = {"revolute": "rad, rad/s, rad/s^2, N m", "prismatic": "m, m/s, m/s^2, N"}
 """Units of position, velocity, acceleration and torque of a joint."""
+
+
+def describe_model(model: TorqueModel, origin: ModelOrigin, order: Sequence[int] | None = None) -> dict[str, Any]:
+    """Return origin, joints and units of a model. order: places of the joints, if not those of the data."""
+    joints = range(model.n_joints) if order is None else order
+    return {
+        "model": origin.model,
+        "version": origin.version,
+        "revision": origin.revision,
+        "sha256": origin.digest,
+        "joints": [model.joint_names[joint] for joint in joints],
+        "units": [UNITS[model.joint_types[joint]] for joint in joints],
+        "torque": model.torque_convention,
+    }
 
 
 @dataclass(frozen=True)
@@ -31,14 +46,7 @@ class Sheet:
         """Return the facts about the arm of a model."""
         order, names = arm.order, arm.joints.names
         errors = torque_shortfall(model, arm)
-        about = {
-            "model": origin.model,
-            "version": origin.version,
-            "revision": origin.revision,
-            "sha256": origin.digest,
-            "joints": list(names),
-            "units": [UNITS[model.joint_types[joint]] for joint in order],
-            "torque": model.torque_convention,
+        about = describe_model(model, origin, [int(joint) for joint in order]) | {
             "max_error": {
                 name: {term: float(f"{error[joint]:.3g}") for term, error in errors.items() if error[joint]}
                 for name, joint in zip(names, order, strict=True)

@@ -418,11 +418,10 @@ def reordered(values: Array, rows: Indices, axis: int = 0) -> Array:
 def on_diagonal(values: Array) -> Array:
     """Return blocks with these values on the diagonal and zero elsewhere: (n, *batch) to (n, n, *batch)."""
     n = values.shape[0]
-    unit = array_namespace(values).eye(n, dtype=values.dtype, device=device(values))
+    unit = constant(np.eye(n), values)
     return unit.reshape((n, n) + (1,) * (values.ndim - 1)) * values
 
 
 def on_last_diagonal(values: Array) -> Array:
     """Return the same blocks with the joints last: (*batch, n) to (*batch, n, n)."""
-    xp = array_namespace(values)
-    return values[..., None] * xp.eye(values.shape[-1], dtype=values.dtype, device=device(values))
+    return values[..., None] * constant(np.eye(values.shape[-1]), values)

@@ -261,9 +261,9 @@ def compare(
 @app.command("export")
 def export_(
     model: ModelVersion,
-    path: Annotated[Path, typer.Argument(help="File to write; for the format c, the folder.")],
+    path: Annotated[Path, typer.Argument(help="File to write; for c, onnx and jax, the folder.")],
     format: Annotated[  # noqa: A002 - the option's name
-        ExportFormat, typer.Option(help="archive: for another service. Others: rigid-body models only.")
+        ExportFormat, typer.Option(help="archive: for another service. urdf, mjcf, c: rigid-body models only.")
     ] = "archive",
     learnt: Annotated[
         bool, typer.Option(help="Include what was learnt online, or export the version as trained.")
@@ -271,15 +271,18 @@ def export_(
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Export a version: archive for another service, URDF, MJCF for MuJoCo, or C99 code for hard real time.
+    """Export a version: archive for another service, URDF, MJCF for MuJoCo, C99 code for hard real time, or a function.
 
     URDF and MJCF have physically possible bodies, friction and rotors. Comments state the largest torque error of each
     joint. The C code computes torque and standard deviation, with or without a payload. It has no dependencies and does
     not allocate memory; see lipserve_model.h for its use.
+
+    onnx writes a model repository that onnxruntime and Triton load, torch an archive of torch.export, jax functions of
+    jax.export. They load without LIPServe and compute torque and standard deviation of a batch of states.
     """
     with connected(url) as client:
         written = client.export(model, path, learnt=learnt, format=format)
-    files = sorted(written.iterdir()) if written.is_dir() else [written]
+    files = [each for each in written.rglob("*") if each.is_file()] if written.is_dir() else [written]
     size = sum(each.stat().st_size for each in files)
     notes = {
         "archive": f"; `lipserve models import {written}` imports it",

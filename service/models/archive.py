@@ -17,7 +17,6 @@ from lipcore.export.formats import FORMATS
 from lipcore.export.origin import ModelOrigin
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
-from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import ExportFormat
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
 from service.models import registry
@@ -25,6 +24,7 @@ from service.models.archive_reading import BLOCK, CHECKSUMS, EXPORT, FORMAT, FOR
 from service.models.exports import note_export
 from service.models.lineage import software
 from service.models.loaded import LoadedModels
+from service.models.tracing import write_in_process
 from service.storage.database import VersionRow, now
 
 MEDIA_TYPE = "application/x-tar"
@@ -64,7 +64,7 @@ def export(
         origin = ModelOrigin(row.model, row.version, revision, persistence.sha256(files[TENSORS]))
         if kind != "archive":
             manifest = json.loads(files[MANIFEST]) if revision else row.manifest
-            made = _export_as(kind, loaded, persistence.decode(files), manifest["parameters"], origin)
+            made = _export_as(kind, loaded, files, manifest["parameters"], origin)
             note_export(loaded.database, origin, kind)
             return made
     except ModelFormatError as error:
@@ -90,20 +90,29 @@ def export(
 
 
 def _export_as(
-    kind: ExportFormat, loaded: LoadedModels, model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin
+    kind: ExportFormat,
+    loaded: LoadedModels,
+    files: Mapping[str, bytes],
+    parameters: Mapping[str, Any],
+    origin: ModelOrigin,
 ) -> ExportedFile:
     """Return a model in one of FORMATS; raise InvalidRequestError if the format cannot express it."""
     form = FORMATS[kind]
     try:
-        files = form.write(model, parameters, origin)
+        if form.is_traced:
+            written = write_in_process(kind, files, parameters, origin)
+        else:
+            written = form.write(persistence.decode(files), parameters, origin)
+    except ModelFormatError:
+        raise
     except ValueError as error:
         item = problem("version", origin.version, f"a version of estimator {', '.join(form.estimators)}")
         message = f"version {origin.version} of model {origin.model!r} cannot be written as {kind}: {error}"
         raise InvalidRequestError(message, [item]) from error
     if form.media_type is not None:
-        ((name, content),) = files.items()
+        ((name, content),) = written.items()
         return ExportedFile(name, form.media_type, len(content), iter((content,)))
-    file = _packed(loaded, files)
+    file = _packed(loaded, written)
     return ExportedFile(f"{origin.stem}-{kind}.tar", MEDIA_TYPE, file.tell(), _pieces(file))
 
 

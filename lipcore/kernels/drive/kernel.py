@@ -127,7 +127,7 @@ class DriveKernel(LinearKernel):
         """Return Φᵀ of N queries, (f n, n, N), see `LinearKernel.formula`."""
         xp, terms = array_namespace(x.dq), self.drive.formula(x)
         of_joints = on_diagonal(xp.permute_dims(terms, (2, 0, 1)))
-        return xp.permute_dims(of_joints, (1, 2, 0, 3)).reshape(-1, self.n_joints, len(x))
+        return xp.permute_dims(of_joints, (1, 2, 0, 3)).reshape(-1, self.n_joints, x.q.shape[0])
 
     def weighted(self, weights: Array, x: Motion) -> Array:
         """Return Φ w of N queries, (n, N), without the features; see `LinearKernel.weighted`."""

@@ -84,8 +84,12 @@ async def import_version(
     responses={
         **responses(NotFoundError, UnreadableVersionError),
         200: {
-            "description": "A tar file, or XML for `urdf` and `mjcf`",
-            "content": {archive.MEDIA_TYPE: _BINARY, "application/xml": {"schema": {"type": "string"}}},
+            "description": "A tar file, XML for `urdf` and `mjcf`, or a binary file for `torch`",
+            "content": {
+                archive.MEDIA_TYPE: _BINARY,
+                "application/xml": {"schema": {"type": "string"}},
+                "application/octet-stream": _BINARY,
+            },
         },
     },
 )
@@ -98,7 +102,7 @@ async def export_version(
     alias: WhichAlias = None,
     learnt: Annotated[bool, Query(description="Include what was learnt online; false: as trained")] = True,
     format: Annotated[  # noqa: A002 - the field's own name
-        ExportFormat, Query(description="`archive`: any estimator; others: rigid-body estimators only, else 422")
+        ExportFormat, Query(description="`urdf`, `mjcf`, `c`: rigid-body estimators only, else 422")
     ] = "archive",
 ) -> StreamingResponse:
     """Return a version as a file. It contains its origin: name, version, revision and hash.
@@ -108,8 +112,11 @@ async def export_version(
       Comments state the largest torque error of each joint, and parameters that torque cannot identify.
     - `c`: a tar of `lipserve_model.c` and `lipserve_model.h`, C99 code for control loops that computes torque and its
       standard deviation without dependencies or allocation. The header explains how to use it.
+    - `onnx`: a tar of a model repository, which Triton serves and whose files onnxruntime loads, float64 and float32.
+    - `torch`: an archive of `torch.export`. `jax`: a tar of functions of `jax.export`.
 
-    All but the archive have a self-test of 100 states.
+    The last three compute torque and standard deviation of a batch of states, without LIPServe. All but the archive
+    have a self-test of 100 states.
     """
     made = await to_thread.run_sync(archive.export, loaded, model, version, alias, learnt, format, limiter=turns)
     headers = {"Content-Length": str(made.size), "Content-Disposition": f'attachment; filename="{made.name}"'}

@@ -1,6 +1,8 @@
 """Export of the arm that a version has learnt as URDF and MJCF."""
 
+import io
 import json
+import tarfile
 from xml.etree import ElementTree
 
 import numpy as np
@@ -79,6 +81,16 @@ def test_version_without_an_arm_is_rejected(api, arm, kind):
     assert "version 1 of model 'urdf-none'" in refusal["message"]
     assert "no rigid bodies" in refusal["message"]
     assert refusal["detail"][0]["field"] == "version"
+
+
+def test_function_is_written_in_another_process(api, arm):
+    answer = export(api, arm, "onnx", version=1)
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-disposition"] == 'attachment; filename="urdf-arm-v1-onnx.tar"'
+    with tarfile.open(fileobj=io.BytesIO(answer.content)) as archive:
+        assert "urdf-arm/1/model.onnx" in archive.getnames()
+        facts = json.load(archive.extractfile("self_test.json"))
+    assert (facts["model"], facts["version"], len(facts["self_test"]["tau"])) == (arm, 1, 100)
 
 
 def test_status_names_outdated_exports(api):

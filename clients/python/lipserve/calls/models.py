@@ -155,7 +155,7 @@ def retry(_route: Route, job: str, *, idempotency_key: str | None = None) -> Cal
 
 ARCHIVE_TIMEOUT = 600.0
 """Max time for the service to pack or check an archive, s."""
-FILE_FORMATS = ("archive", "urdf", "mjcf")
+FILE_FORMATS = ("archive", "urdf", "mjcf", "torch")
 """Formats of one file. The others are folders, sent as a tar."""
 
 
@@ -275,18 +275,18 @@ def export(
     version: int | None = None,
     alias: str | None = None,
     learnt: bool = True,
-    format: Literal["archive", "urdf", "mjcf", "c"] = "archive",  # noqa: A002 - the API's own name
+    format: Literal["archive", "urdf", "mjcf", "c", "onnx", "torch", "jax"] = "archive",  # noqa: A002 - the API's own name
 ) -> Call[Path]:
-    """Export a version as an archive for `import_model`, or for simulators and control loops.
+    """Export a version as an archive for `import_model`, or for simulators, planners and control loops.
 
     Args:
         model: Name of the model, also as `NAME@3` or `NAME@ALIAS`.
-        path: File to write; it is written completely or not at all. For `c`: the folder.
+        path: File to write; it is written completely or not at all. For `c`, `onnx` and `jax`: the folder.
         version: Version number. Default: the serving version.
         alias: Alias of the version, instead of its number.
         learnt: Include what was learnt online; else export the version as trained.
-        format: `archive`; or, for rigid-body models only, `urdf`, `mjcf` (MuJoCo), or `c` for `lipserve_model.c` and
-            `lipserve_model.h`.
+        format: `archive`; a function of any estimator as `onnx` (a model repository of Triton), `torch` or `jax`; for
+            rigid-body models only, `urdf`, `mjcf` (MuJoCo), or `c` for `lipserve_model.c` and `lipserve_model.h`.
 
     Returns:
         The path.

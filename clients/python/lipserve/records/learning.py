@@ -146,7 +146,7 @@ class Export(Record, frozen=True, kw_only=True):
     outdated: Whether another version serves, or this one has learnt since
     """
 
-    format: Literal["archive", "urdf", "mjcf", "c"]
+    format: Literal["archive", "urdf", "mjcf", "c", "onnx", "torch", "jax"]
     version: int
     revision: int
     at: str

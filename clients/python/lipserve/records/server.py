@@ -28,7 +28,7 @@ class Health(Record, frozen=True, kw_only=True):
         estimators se, gip and lse, on a GPU if there is one; `robots`, to use URDFs; `sim`, to simulate robots and know
         them by name; `ingest`, to read CSV, Parquet, HDF5, Excel, LeRobot and bags (NPZ and JSON need no extra);
         `cluster`, to share PostgreSQL, S3 and a Dask cluster; `grpc`, to serve over gRPC; `opentelemetry`, to send
-        traces; `plot`, to draw pictures
+        traces; `onnx`, to export ONNX; `jax`, to export functions of JAX; `plot`, to draw pictures
     missing: Extras that are not installed
     confined: Available confinement of the process that reads uploads: limits of `memory` and `processor` time;
         `landlock` blocks files; `seccomp` blocks the network and other processes

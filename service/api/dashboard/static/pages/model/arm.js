@@ -8,7 +8,7 @@ import { html, useMemo, useRef, useState } from "../../preact.js";
 import { AMBIGUITY_NOTE, drawable, drawing, LEGEND } from "../arm/drawing.js";
 import { AxisTable, ParameterTable } from "../arm/tables.js";
 import { Dial, middle } from "./dial.js";
-import { ARM_FORMATS, exportVersion } from "./export.js";
+import { ARM_FORMATS, exportVersion, FUNCTION_FORMATS } from "./export.js";
 
 const DEGREES = 180 / Math.PI;
 const WIDE = 500; // px
@@ -21,16 +21,19 @@ export function Arm({ model: { name }, version }) {
       ? html`<${Card} title="Learnt arm">
           ${drawable() ? html`<${Figure} version=${version} />` : html`<p class="hint">3-D drawing is not available: WebGL is off in this browser. The tables contain the same values.</p>`}
           <details class="hint"><summary>How to read this</summary><p>${LEGEND}${orientationNote(geometry.gravity)} ${AMBIGUITY_NOTE}</p></details>
-          <div class="actions">
-            ${Object.entries(ARM_FORMATS).map(([format, label]) => html`<${Button} key=${format} onclick=${() => exportVersion(name, version.version, format)}>Save as ${label}<//>`)}
-          </div>
+          <${Exports} name=${name} version=${version.version} formats=${{ ...ARM_FORMATS, ...FUNCTION_FORMATS }} />
         <//>`
-      : html`<p class="empty">This version has no arm: its estimator does not learn rigid bodies. Train a version with the estimator rigid-body.</p>`}
+      : html`<p class="empty">This version has no arm: its estimator does not learn rigid bodies. Train a version with the estimator rigid-body.</p><${Exports} name=${name} version=${version.version} formats=${FUNCTION_FORMATS} />`}
     <${Card} title=${inertia ? "Masses and friction" : "Friction"}><${ParameterTable} version=${version} /><p class="hint">${inertia && massNote(inertia)}${FRICTION_NOTE}</p><//>
     ${inertia && html`<${Card} title="Axes and centres of mass"><${AxisTable} version=${version} /><//>`}`;
 }
 
 const FRICTION_NOTE = "Friction is viscous · dq + Coulomb · sign(dq) + offset; the offset includes every other constant torque. Grey values are within two standard deviations of zero. Values as trained, without online learning.";
+
+/** Buttons that save the version in these formats. */
+function Exports({ name, version, formats }) {
+  return html`<div class="actions">${Object.entries(formats).map(([format, label]) => html`<${Button} key=${format} onclick=${() => exportVersion(name, version, format)}>Save as ${label}<//>`)}</div>`;
+}
 
 function Figure({ version }) {
   const { joint_names: names, joint_types: types, training_range: { q: range } } = version;

@@ -6,7 +6,10 @@ import { key } from "../../keys.js";
 /** Formats of an arm, with their labels. */
 export const ARM_FORMATS = { urdf: "URDF", mjcf: "MJCF (MuJoCo)", c: "C" };
 
-/** Save a version in a format: `archive`, or one of ARM_FORMATS. */
+/** Formats of a function of any estimator, with their labels. */
+export const FUNCTION_FORMATS = { onnx: "ONNX", torch: "PyTorch", jax: "JAX" };
+
+/** Save a version in a format: `archive`, or one of ARM_FORMATS or FUNCTION_FORMATS. */
 export async function exportVersion(name, version, format = "archive") {
   const headers = key() ? { authorization: `Bearer ${key()}` } : {};
   const answer = await fetch(`/v1/models/${encodeURIComponent(name)}/export?version=${version}&format=${format}`, { headers });
