@@ -20,9 +20,9 @@ PLATFORMS = ("cpu", "cuda")
 def jax_files(model: TorqueModel, origin: ModelOrigin) -> dict[str, bytes]:
     """Return the serialised functions and their facts by file name.
 
-    - `STEM.torque.jax`: the torque, with its derivative.
-    - `STEM.torque_std.jax`: torque and standard deviation.
-    - `STEM.json`: origin, arguments and self-test.
+    - STEM.torque.jax: the torque, with its derivative.
+    - STEM.torque_std.jax: torque and standard deviation.
+    - STEM.json: origin, arguments and self-test.
 
     Raise MissingExtraError without JAX.
     """
