@@ -35,7 +35,7 @@ MIN_SHARE = 0.01
 """Min torque of a joint relative to the largest one: smaller errors do not matter."""
 BARRIER = 1e-5
 """Last barrier, in squared errors relative to the torque. A coefficient that wants to be zero becomes about 1e-4 of its
-scale."""
+scale. Errors of the same nine models were equal from 1e-8 to 1e-3."""
 
 
 def fit_arm(model: TorqueModel, arm: SimulatedArm) -> SimulatedArm:
