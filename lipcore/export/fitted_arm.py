@@ -31,6 +31,10 @@ STATES = 1000
 RIDGE = 1e-2
 """Weight of a change by one prior standard deviation, relative to an error of one state as large as the torque: that of
 errors of 10 % of the torque. On nine models of real and simulated arms, 1e-3 had the same errors, and larger masses."""
+MAX_DENSITY = 1e4
+"""Max density of a body, kg/m³: steel has 7 900. No body has smaller moments than a ball of this density."""
+PASSES = 6
+"""Max number of fits, each with bodies of the size that the masses of the one before need."""
 MIN_SHARE = 0.01
 """Min torque of a joint relative to the largest one: smaller errors do not matter."""
 BARRIER = 1e-5
@@ -75,12 +79,23 @@ def fit_arm(model: TorqueModel, arm: SimulatedArm) -> SimulatedArm:
         metric = design.T @ design + RIDGE * np.eye(len(scale))
         slope = design.T @ (tau / usual).reshape(-1) + RIDGE * start / scale
         nearest = np.linalg.solve(metric, slope)
-        fitted = nearest_plausible(nearest * scale, scale, metric, n, arm.bodies, np.arange(size, len(scale)), BARRIER)
+        spread, signed = _spread_of(arm.bodies[:, 0]), np.arange(size, len(scale))
+        for _ in range(PASSES):  # with the masses found before
+            fitted = nearest_plausible(nearest * scale, scale, metric, n, arm.bodies, signed, BARRIER, spread)
+            needed = _spread_of(fitted[:size:PARAMETERS])
+            if (needed <= 1.1 * spread).all():
+                break
+            spread = np.maximum(spread, needed)
         error = tau - (features @ fitted) * usual
         if (cost := float(np.square(error / usual).mean())) < best:
             best = cost
             found = _with_values(arm, geometry, fitted, np.sqrt(np.square(error).mean(axis=0)))
     return found
+
+
+def _spread_of(mass: Array) -> Array:
+    """Return the second moment of balls of MAX_DENSITY along each axis, relative to their mass, m². mass: kg."""
+    return np.asarray(np.cbrt(0.75 * mass / (np.pi * MAX_DENSITY)) ** 2 / 5)
 
 
 def _geometries(term: ArmKernel, arm: SimulatedArm, mean: Array) -> list[Geometry]:

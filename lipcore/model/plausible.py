@@ -50,6 +50,7 @@ def nearest_plausible(
     start: Array | None = None,
     positive: NDArray[np.int64] | None = None,
     last: float = 1e-3,
+    spread: Array | None = None,
 ) -> Array:
     """Return the weights (p,) nearest to a mean (p,) that describe plausible bodies in their first 10 n elements.
 
@@ -57,7 +58,8 @@ def nearest_plausible(
     each body's pseudo-inertia being at least that of a tiny real one. Newton's method follows the central path of a
     barrier, −t Σ log det, as in Boyd & Vandenberghe, § 11. start: (n, 10), a plausible guess; balls replace bodies that
     cannot exist. positive: places of weights that cannot be negative, such as rotors and friction. last:
-    barrier, after which at most 4 n times its value of the squared distance remain.
+    barrier, after which at most 4 n times its value of the squared distance remain. spread: min second moment of each
+    body about its centre of mass along every axis, relative to its mass, (n,) m².
     """
     signed = np.zeros(0, np.int64) if positive is None else positive
     size = PARAMETERS * n
@@ -66,11 +68,13 @@ def nearest_plausible(
     # at least a ten-thousandth of the arm's mass, spread by 1 mm along each axis, since no real body is a point
     least = 1e-4 * total * np.diag([1e-6, 1e-6, 1e-6, 1.0])
     centre = mean / scale
-    basis = np.array([pseudo_inertia(unit) for unit in np.eye(PARAMETERS)])
+    wide = np.zeros(n) if spread is None else spread
+    basis = np.tile(np.array([pseudo_inertia(unit) for unit in np.eye(PARAMETERS)]), (n, 1, 1, 1))
+    basis[:, 0, :3, :3] -= wide[:, None, None] * np.eye(3)
 
     def matrices(point: Array) -> Array:
         bodies = (point * scale)[:size].reshape(n, PARAMETERS)
-        return np.asarray(np.einsum("nk,kij->nij", bodies, basis) - least)
+        return np.asarray(np.einsum("nk,nkij->nij", bodies, basis) - least)
 
     def value(point: Array, barrier: float) -> float:
         signs, logs = np.linalg.slogdet(matrices(point))
@@ -82,12 +86,13 @@ def nearest_plausible(
         return float(0.5 * off @ metric @ off - barrier * (logs.sum() + np.log(point[signed]).sum()))
 
     point = centre.copy()
-    point[:size] = np.concatenate([_replace_impossible(body, total / n, least) for body in given]) / scale[:size]
+    begin = [_replace_impossible(body, total / n, least, each) for body, each in zip(given, wide, strict=True)]
+    point[:size] = np.concatenate(begin) / scale[:size]
     point[signed] = np.maximum(point[signed], 1e-3)
     for barrier in 10.0 ** np.arange(3, np.log10(last) - 0.5, -1):
         for _ in range(30):
             inverse = np.linalg.inv(matrices(point))
-            turned = np.einsum("nij,kjl->nkil", inverse, basis)  # P⁻¹ E_k
+            turned = np.einsum("nij,nkjl->nkil", inverse, basis)  # P⁻¹ E_k
             slope = np.einsum("nkii->nk", turned).reshape(-1) * scale[:size]
             bend = np.einsum("nkij,nlji->nkl", turned, turned)
             gradient = metric @ (point - centre)
@@ -113,9 +118,10 @@ def nearest_plausible(
     return np.asarray(point * scale)
 
 
-def _replace_impossible(body: Array, usual_mass: float, least: Array) -> Array:
-    """Return the body, or a ball of the usual mass if the body cannot exist."""
-    if np.linalg.eigvalsh(pseudo_inertia(body) - 2 * least)[0] > 0:
+def _replace_impossible(body: Array, usual_mass: float, least: Array, wide: float) -> Array:
+    """Return the body, or a ball of the usual mass if the body cannot exist. wide: see `spread`."""
+    bound = least + body[0] * wide * np.diag([1.0, 1.0, 1.0, 0.0])
+    if np.linalg.eigvalsh(pseudo_inertia(body) - 2 * bound)[0] > 0:
         return body
-    ball = 0.4 * usual_mass * 0.05**2
+    ball = max(0.4 * usual_mass * 0.05**2, 5 * (least[0, 0] + usual_mass * wide))
     return np.array([usual_mass, 0, 0, 0, ball, 0, ball, 0, 0, ball])

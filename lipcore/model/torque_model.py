@@ -296,7 +296,8 @@ class TorqueModel:
     @property
     def separates_gravity(self) -> bool:
         """Whether `evaluator` computes its torque without gravity: it has bodies and no nonlinear term."""
-        return self.arm is not None and self.evaluator.separates_gravity
+        compact = isinstance(self.posterior, CompactPosterior)
+        return compact and self.arm is not None and self.evaluator.separates_gravity
 
     def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
         """Return the torque at one instant, and its standard deviation if `std`, both (n,) N·m.

@@ -29,7 +29,7 @@ LEARNING = {"contact_threshold": 8.0, "auto_refresh": False, "on_change": "learn
 OF_MODELS = (rows.VersionRow, rows.AliasRow, rows.AliasMoveRow, rows.ServingRow, rows.DeletedModelRow)
 """Rows that define which versions exist and which one serves."""
 QUERIES = ("/v1/jobs/check", "/v1/echo", "/v2/models/{model}/infer", "/v2/models/{model}/versions/{version}/infer")
-QUERIES += tuple(f"{MODEL}/{name}" for name in ("predict", "gravity", "evaluate", "trace", "compare"))
+QUERIES += tuple(f"{MODEL}/{name}" for name in ("predict", "gravity", "wrench", "evaluate", "trace", "compare"))
 UPLOADS = ((POST, "/v1/datasets"), (POST, "/v1/datasets/{dataset}/read"), (POST, "/v1/robots"))
 DELETIONS = ((DELETE, "/v1/datasets/{dataset}"), (DELETE, "/v1/robots/{robot}"))
 UNLISTED = {
