@@ -81,6 +81,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         lock = lock_home(settings.home)
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
         threadpool_limits(SERVING_THREADS)  # of BLAS; the models imported its libraries
+        from lipcore.posterior.threads import limit_threads  # noqa: PLC0415 - the numerics, which are loaded by now
+
+        limit_threads(SERVING_THREADS)
         webhook = Webhook(storage.database, settings)
         _share(app, storage, jobs, learners, webhook)
         stop_following = storage.database.follow_others(lambda: Replication(learners).close)

@@ -1,4 +1,4 @@
-"""Large batches on all processors: compiled code without the GIL, in the threads of one pool."""
+"""Large batches on several processors: compiled code without the GIL, in the threads of one pool."""
 
 from __future__ import annotations
 
@@ -9,6 +9,15 @@ from functools import cache
 
 PART = 2048
 """Rows of a part. Smaller batches are not worth a thread: they take milliseconds."""
+
+
+_most = list[int]()
+
+
+def limit_threads(count: int) -> None:
+    """Use at most `count` threads in this process. A service answers control loops with the other processors."""
+    _most[:] = [count]
+    _pool.cache_clear()
 
 
 def run_parts(count: int, run: Callable[[slice], None]) -> None:
@@ -23,7 +32,9 @@ def run_parts(count: int, run: Callable[[slice], None]) -> None:
 
 
 def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Return the number of processors to use."""
+    found = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min([found, *_most])
 
 
 @cache

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import httpx
 from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select
@@ -131,6 +130,8 @@ class Webhook(Collector):
 
     def _post(self, body: dict[str, Any]) -> str | None:
         """Send one event; return why it failed, None if the receiver has acknowledged it."""
+        import httpx  # noqa: PLC0415 - 20 MB that only a service with a webhook needs
+
         assert self._url is not None
         content = json.dumps(body).encode()
         headers = {

@@ -36,7 +36,7 @@ THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
 )
 SERVING_THREADS = 1
-"""BLAS threads of one prediction: a prediction is too short to share, and other work needs the cores."""
+"""Threads of one prediction: a prediction is too short to share, and other work needs the cores."""
 
 
 @dataclass(frozen=True)

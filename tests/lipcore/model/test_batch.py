@@ -53,6 +53,15 @@ def test_parts_of_a_batch_equal_the_whole(monkeypatch: pytest.MonkeyPatch) -> No
     np.testing.assert_array_equal(model.torque(*motion), alone[1])
 
 
+def test_threads_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(threads, "_most", [])
+    monkeypatch.setattr(threads, "PART", 1)
+    threads.limit_threads(1)
+    seen = set[int]()
+    threads.run_parts(3, lambda _: seen.add(threading.get_ident()))
+    assert seen == {threading.get_ident()}
+
+
 def test_an_error_in_a_part_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threads, "PART", 1)
 
