@@ -40,7 +40,7 @@ class Options:
         folder: folder of the model.
         calls: calls of each function.
         queries: number of instants of the motion.
-        flags: compiler flags.
+        flags: compiler flags of the model. Pinocchio is called with -O2, as its library is compiled.
         eigen: folder of Eigen's headers, to call Pinocchio from C++; None: from Python.
         seed: seed of the motion.
     """
@@ -150,7 +150,7 @@ def _time_cpp(robot: Robot, options: Options, motion: Array, folder: Path) -> Ti
     robot.model.saveToText(str(folder / "robot"))
     np.array([np.concatenate([robot.configuration(q), dq, ddq]) for q, dq, ddq in motion]).tofile(folder / "motions")
     defined = [f"-D{each}" for each in (*PINOCCHIO, "PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION")]
-    command = ["c++", "-std=c++17", *options.flags, *defined, f"-I{options.eigen}", f"-I{prefix / 'include'}"]
+    command = ["c++", "-std=c++17", "-O2", *defined, f"-I{options.eigen}", f"-I{prefix / 'include'}"]
     libraries = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-lpinocchio_default", "-lboost_serialization"]
     _do([*command, str(HERE / "rnea.cpp"), *libraries, "-o", "rnea"], folder)
     _do([str(folder / "rnea"), "robot", str(options.calls), "motions", "times"], folder)

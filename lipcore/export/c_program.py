@@ -5,12 +5,14 @@ from __future__ import annotations
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.graph import Graph, Number, Program
+from lipcore.kernels.joint_frame_features import features
 from lipcore.kernels.joint_frames import links_of, torque
 
 QUERY = ("q", "dq", "ddq", "sine", "cosine")
@@ -20,15 +22,32 @@ LONGEST = 300
 PAYLOAD = 10
 
 
-def bodies_statements(geometry: Geometry, step: Array, bodies: Array, change: Array) -> str:
-    """Return the statements of `write_out`: see `joint_frames.links_of`."""
-    n, graph = geometry.n_joints, Graph()
-    q, dq, ddq, *turn = (graph.inputs(n) for _ in QUERY)
-    torques = torque(*links_of(geometry, step, bodies, change), q, dq, ddq, turn, graph.inputs(PAYLOAD))
-    texts = [*_query_texts(n), *(f"more[{k}]" for k in range(PAYLOAD))]
-    results = {f"load[{j}]": each.value for j, each in enumerate(torques)}
-    results |= {f"tau[{j}]": each.value + each.change for j, each in enumerate(torques)}
-    return _statements(results, texts)
+@dataclass(frozen=True)
+class BodiesProgram:
+    """The torque of bodies, and its derivatives, as statements."""
+
+    torque: str
+    """Statements of `write_torque`."""
+    features: str
+    """Statements of `write_features`."""
+    weights: Array
+    """T, (10 n + g, b): the numbers that the features belong to are Tᵀ times changes of bodies and geometry."""
+    first: list[int]
+    """The first feature of each joint that is not zero, (n,)."""
+
+    @classmethod
+    def of(cls, geometry: Geometry, step: Array, bodies: Array, change: Array) -> BodiesProgram:
+        """Return the program of an arm; for the arguments see `joint_frames.links_of`. A fixed geometry has no step."""
+        n, graph = geometry.n_joints, Graph()
+        q, dq, ddq, *turn = (graph.inputs(n) for _ in QUERY)
+        more = graph.inputs(PAYLOAD)
+        found = torque(*links_of(geometry, step, bodies, change), q, dq, ddq, turn, more)
+        results = {f"load[{j}]": each.value for j, each in enumerate(found)}
+        results |= {f"tau[{j}]": each.value + each.change for j, each in enumerate(found)}
+        rows, weights, first = features(geometry, bodies, len(step) > 0, q, dq, ddq, turn, more)
+        texts = [*_query_texts(n), *(f"more[{k}]" for k in range(PAYLOAD))]
+        rest = {f"rest[{j}][{c}]": row[c] for j, row in enumerate(rows) for c in range(first[j], len(row))}
+        return cls(_statements(results, texts), _statements(results | rest, texts), weights, first)
 
 
 def others_statements(arms: Iterable[tuple[Geometry, Array]]) -> str:
@@ -52,6 +71,7 @@ def _query_texts(n: int) -> list[str]:
 def _statements(results: dict[str, Number], inputs: Sequence[str]) -> str:
     """Return statements that assign the results by name. Operations that are used once are parts of expressions."""
     program = Program.of(list(results.values()))
+    inputs = [*inputs, *[""] * (program.inputs - len(inputs))]  # those that no result needs
     uses = Counter(place for each in program.operations for place in each.arguments)
     uses.update(program.results)
     texts, lines, first = [*inputs, *map(repr, program.constants)], list[str](), len(inputs) + len(program.constants)

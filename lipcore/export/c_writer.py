@@ -1,9 +1,8 @@
 """A model of rigid bodies as C99 for hard real time: source and header, from the templates in `lipcore/export/c`.
 
-Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean is written without features,
-operation by operation, see `c_program`. The standard deviation is |Uᵀ φ_b|, see
-`c_weights`. A nonlinear term adds its covariances with stored torques, see `c_rest`. Each joint's frame is turned so
-that its axis is z. The two vectors across the axis, about which the geometry steps, are x and y.
+Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean and the features φ_b of the
+bodies are written operation by operation, see `c_program`. The standard deviation is |Uᵀ φ_b|, see `c_weights`. A
+nonlinear term adds its covariances with stored torques, see `c_rest`.
 """
 
 from __future__ import annotations
@@ -20,15 +19,9 @@ import numpy as np
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.export.c_program import bodies_statements, others_statements
+from lipcore.export.c_program import BodiesProgram, others_statements
 from lipcore.export.c_rest import NonlinearTerm, correction_tables
-from lipcore.export.c_weights import (
-    LinearWeights,
-    UnsupportedEstimatorError,
-    axes_of,
-    group_parameters,
-    move_parameters,
-)
+from lipcore.export.c_weights import LinearWeights, UnsupportedEstimatorError, expand_weights
 from lipcore.export.origin import SELF_TEST_STATES, ModelOrigin, draw_states
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.drive.kernel import DriveKernel
@@ -38,7 +31,6 @@ from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.fast.drive import HARMONICS
 from lipcore.kernels.fast.play import CERTAIN_SHARE
-from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.model import dynamics
 from lipcore.model.body import Body
@@ -82,14 +74,12 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
     """Return all numbers of the source."""
     arm, posterior = learnt.arm.arm, model.posterior
     n, size, order = arm.n_joints, PARAMETERS * arm.n_joints, arm.order
-    kept, expand = group_parameters(learnt)
-    root, shared = learnt.root(expand)
-    others = 0 if learnt.arm.others is None else learnt.arm.others.size
     rubbing = learnt.mean[learnt.arm.size :].reshape(n, -1)
     own = np.concatenate([learnt.mean[size : size + n, None], rubbing], axis=1)[order]
-    bodies = learnt.mean[:size].reshape(n, PARAMETERS)[order]
-    table = _arm_table(arm.geometry, arm.parameters, own)
-    step, change = learnt.mean[learnt.arm.steps], bodies - arm.parameters
+    change = learnt.mean[:size].reshape(n, PARAMETERS)[order] - arm.parameters
+    program = BodiesProgram.of(arm.geometry, learnt.mean[learnt.arm.steps], arm.parameters, change)
+    root, shared = learnt.root(expand_weights(learnt, program.weights))
+    others = 0 if learnt.arm.others is None else learnt.arm.others.size
     owns, share, others_written = "{0}", "{0}", ""
     if learnt.arm.others is not None:
         gravity = arm.alternatives[0].geometry.gravity
@@ -101,8 +91,6 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
             )
         )
         share = _braced(learnt.arm.others.mixing @ learnt.mean[learnt.arm.steps.stop : learnt.arm.size])
-    padded = [[*names, *[0] * (7 - len(names))] for names in kept]
-    counts = [len(names) for names in kept]
     limits = [[model.training_range[name][end] for end in ("min", "max")] for name in ("q", "dq", "ddq")]
     body = PAYLOAD.inertia
     assert body is not None
@@ -113,17 +101,13 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "friction": str(rubbing.shape[1]),
         **{kind: str(int(kind in learnt.friction.drive.kinds)) for kind in DRIVE_KINDS},
         "harmonics": str(HARMONICS),
-        "bodies": str(sum(counts)),
-        "steps": str(arm.steps),
+        "numbers": str(program.weights.shape[1]),
         "others": str(others),
         "vectors": str(VECTORS),
         "order": _integers(order),
         "slides": _integers([kind == "prismatic" for kind in arm.geometry.joint_types]),
-        "screws": _integers(arm.geometry.screws if arm.steps else [0] * n),
-        "first": _integers(np.concatenate([[0], np.cumsum(counts)[:-1]])),
-        "count": _integers(counts),
-        "kept": "{" + ", ".join(_integers(names) for names in padded) + "}",
-        "tip": _braced(axes_of(arm.geometry)[-1].T.reshape(-1)),
+        "first": _integers(program.first),
+        "tip": _braced(np.append(arm.geometry.across[-1], arm.geometry.axis[-1])),
         "sign_width": repr(SIGN_WIDTH),
         "slow_speed": repr(STRIBECK_SPEED),
         "elements": str(len(ELEMENTS)),
@@ -137,9 +121,10 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         "shapes": _braced(SHAPE_SPEEDS),
         "accelerated": repr(ACCELERATED),
         "quantile": repr(quantile(LEVEL)),
-        "arm": table,
+        "drive": _braced(own),
         "owns": owns,
-        "written_out": bodies_statements(arm.geometry, step, arm.parameters, change),
+        "torque_written_out": program.torque,
+        "features_written_out": program.features,
         "others_written_out": others_written,
         "share": share,
         "root": _braced(_panels(root)),
@@ -186,21 +171,6 @@ def _texts(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
     }
 
 
-def _arm_table(geometry: Geometry, bodies: Array, own: Array) -> str:
-    """Return the initializer of an `arm_t`. bodies: (n, 10), own: (n, 4 or more), base to tip."""
-    n, axes = geometry.n_joints, axes_of(geometry)
-    before = np.concatenate([np.eye(3)[None], axes[:-1]])
-    turn = before.mT @ geometry.rotation @ axes
-    place = (before.mT @ geometry.translation[..., None])[..., 0]
-    turned = np.stack([move_parameters(axes[j].T, np.zeros(3), bodies[j]) for j in range(n)])
-    names, numbers = (
-        ("gravity", "turn", "place", "body", "own"),
-        (geometry.gravity, turn.reshape(n, 9), place, turned, own),
-    )
-    fields = [f".{name} = {_braced(value)}" for name, value in zip(names, numbers, strict=True)]
-    return "{\n" + ",\n".join(fields) + "}"
-
-
 def _rest(rest: NonlinearTerm | None, shared: Array) -> dict[str, str]:
     """Return the contribution of a nonlinear term, empty for rigid bodies alone. shared: V of `LinearWeights.root`."""
     if rest is None:
@@ -231,11 +201,12 @@ def _correction(posterior: CompactPosterior, shared: Array) -> dict[str, str]:
 
 
 def _stack(model: TorqueModel) -> str:
-    """Return the stack of a call in kB. It contains the links, and covariances and products of energies."""
+    """Return the stack of a call in kB: features, covariances and products of energies, some of them twice."""
     n, outputs = model.n_joints, len(model.posterior.basis.outputs)
     residual = model.posterior.basis.residual
     rows = 0 if residual is None else (n + 1) * int(residual.sizes.max())
-    return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0) + 8e-3 * rows))
+    energies = 2 * 8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0
+    return str(round(4 + 0.5 * n**2 + energies + 2 * 8e-3 * rows))
 
 
 def _panels(root: Array) -> Array:

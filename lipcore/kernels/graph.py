@@ -188,6 +188,46 @@ def _ratio(one: Number, other: Number) -> Number:
     return one.graph.number("/", one.place, other.place)
 
 
+def jacobian(results: Sequence[Number], inputs: Sequence[Number]) -> list[list[Number]]:
+    """Return the derivative of each result with respect to each input, by adjoints from the result back.
+
+    Raise ValueError if a result depends on an input by operations other than sums, differences, products and signs.
+    """
+    graph, active = inputs[0].graph, {each.place for each in inputs}
+    for place, (name, *arguments) in enumerate(graph.nodes[: max(each.place for each in results) + 1]):
+        if name not in (INPUT, CONSTANT) and not active.isdisjoint(arguments):
+            active.add(place)
+    rows = []
+    for result in results:
+        adjoints = {result.place: _of(graph, 1.0)}
+        for place in range(result.place, -1, -1):
+            if place not in adjoints or place not in active:
+                continue
+            for argument, share in _shares(Number(graph, place), adjoints[place]):
+                before = adjoints.get(argument)
+                adjoints[argument] = share if before is None else before + share
+        rows.append([adjoints.get(each.place, _of(graph, 0.0)) for each in inputs])
+    return rows
+
+
+def _shares(number: Number, adjoint: Number) -> list[tuple[int, Number]]:
+    """Return the shares that the places of an operation's arguments have in its adjoint."""
+    name, *arguments = number.node
+    one, other = (arguments * 2)[:2]
+    match name:
+        case "input":
+            return []
+        case "negative":
+            return [(one, -adjoint)]
+        case "+":
+            return [(one, adjoint), (other, adjoint)]
+        case "-":
+            return [(one, adjoint), (other, -adjoint)]
+        case "*":
+            return [(one, adjoint * Number(number.graph, other)), (other, adjoint * Number(number.graph, one))]
+    raise ValueError(f"the operation is {name!r}, expected +, -, * or negative")
+
+
 @dataclass(frozen=True)
 class Program:
     """Operations in the order in which they run. Places count inputs first, then constants, then operations."""

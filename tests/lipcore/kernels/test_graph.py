@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lipcore.kernels.graph import Graph, Operation, Program
+from lipcore.kernels.graph import Graph, Operation, Program, jacobian
 
 FUNCTIONS: dict[str, Callable[..., float]] = {
     "+": lambda a, b: a + b,
@@ -62,3 +62,27 @@ def test_operations_that_no_result_needs_are_left_out() -> None:
     x, y = Graph().inputs(2)
     left_out = (x * y) * 0.0
     assert Program.of([left_out + x]).operations == ()
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda x: [x[0] * x[1] - x[2] * (x[0] + 2.0), -(x[1] * x[1]) * x[2]],
+        lambda x: [x[0] + (x[1] - x[0]), 3.0 - x[2], x[1] * (x[1] * x[1])],
+    ],
+)
+def test_jacobian_is_that_of_central_differences(formula: Callable[[Any], Any]) -> None:
+    inputs = Graph().inputs(3)
+    rows = jacobian(formula(inputs), inputs)
+    program = Program.of([each for row in rows for each in row])
+    for values in np.random.default_rng(0).uniform(0.2, 2.0, (5, 3)):
+        found = np.reshape(evaluate(program, values.tolist()), (-1, 3))
+        for k, step in enumerate(1e-6 * np.eye(3)):
+            expected = (np.array(formula(values + step)) - formula(values - step)) / 2e-6
+            np.testing.assert_allclose(found[:, k], expected, atol=1e-8)
+
+
+def test_jacobian_of_other_operations_is_rejected() -> None:
+    x, y = Graph().inputs(2)
+    with pytest.raises(ValueError, match=r"the operation is 'sin', expected \+, -, \* or negative"):
+        jacobian([x * np.sin(np.array([y], dtype=object))[0]], [x, y])
