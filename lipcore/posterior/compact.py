@@ -12,6 +12,7 @@ from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.base import LinearKernel, Params, TorqueKernel, on_last_diagonal
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.exact import Posterior, Prediction
+from lipcore.posterior.layout import feature_factors
 from lipcore.posterior.linalg import block_diagonal, solve_lower, solve_lower_right
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Solution, Statistics, learnt_root, rounding_of, solve
@@ -165,25 +166,19 @@ class CompactPosterior(Posterior):
         more = np.maximum(self.misfit.variance(query), self.floor - variance)
         return Prediction(prediction.mean, prediction.covariance + on_last_diagonal(more))
 
-    @cached_property
+    @property
     def slopes(self) -> Array:
         """Factors in the mean, (M,), of the torques' covariances and of the linear terms' features Φᵀ."""
-        slopes = self.weights * self._variances
-        for each in self.basis.linear:
-            if (centre := each.prior_weights()) is not None:
-                slopes[self.basis.rows(each)] += centre
-        return slopes
-
-    @cached_property
-    def feature_root(self) -> Array:
-        """Q for the linear terms' features Φᵀ instead of their covariances Λ Φᵀ, (M, M)."""
-        return self.root * self._variances
+        return self._feature_factors[0]
 
     @property
-    def _variances(self) -> Array:
-        """Prior variances of the linear weights, one for the torques, (M,)."""
-        own = [each.variances(self.params) for each in self.basis.linear]
-        return np.concatenate([np.ones(len(self.basis.outputs)), *own])
+    def feature_root(self) -> Array:
+        """Q for the linear terms' features Φᵀ instead of their covariances Λ Φᵀ, (M, M)."""
+        return self._feature_factors[1]
+
+    @cached_property
+    def _feature_factors(self) -> tuple[Array, Array]:
+        return feature_factors(self.basis.linear, self.params, self.weights, self.root)
 
     @cached_property
     def covariance(self) -> Array:

@@ -3,39 +3,25 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.kernels.drive.terms import SIGN_WIDTH
-from lipcore.kernels.fast.answer import (
-    COVARIANCE,
-    MEAN,
-    MISFIT_ROWS,
-    ROWS,
-    STD,
-    WIDTH,
-    answer,
-    answer_one,
-    pack,
-    pack_joints,
-)
+from lipcore.kernels.fast.answer import COVARIANCE, MEAN, MISFIT_ROWS, ROWS, STD, WIDTH, answer, answer_one
 from lipcore.kernels.fast.play import POSITIONS
-from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.kernels.residual import ResidualKernel
+from lipcore.posterior.gravity import Gravity, at_rest
+from lipcore.posterior.layout import check_factors, feature_factors, pack_factors, prior_variances, weights_of_joints
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.threads import run_parts
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 QUERIES = 16
 """Queries computed together. Each panel of the root is then read once for many queries, and they still fit the
@@ -51,34 +37,13 @@ class _Scratch(threading.local):
         self.deflected = np.zeros((queries, POSITIONS + 2 * len(ELEMENTS), n))
         self.blocks = np.zeros((queries, samples + 1, n, n))
         self.features = np.zeros((queries, linear, n))
-        self.still = np.zeros((queries, POSITIONS, n))
-        self.gravity = np.zeros((queries, linear, n))
+        self.prior = np.zeros((2, queries, n))
         self.memory = np.zeros(groups * WIDTH * (queries * anchors + ROWS))
         self.std = np.zeros((queries, n))
         self.covariance = np.zeros((queries, n, n))
         self.share = np.zeros((queries, n))
-        self.prior = np.zeros((2, queries, n))
-        self.of_one = (
-            self.motions,
-            self.deflected,
-            self.blocks,
-            self.features,
-            self.prior,
-            self.covariance,
-            self.memory,
-            self.std,
-            self.share,
-        )
-
-
-class _GravityTerm(NamedTuple):
-    """A linear term with gravity: places of its features with gravity, all of its features, and what fills them."""
-
-    places: slice | Indices
-    first: int
-    last: int
-    fill: Callable[[Array, Array], None]
-    fill_many: Callable[[Array, Array, int], None]
+        # slicing would cost one query as much as the arithmetic
+        self.work = self.blocks, self.features, self.prior, self.memory
 
 
 class Evaluator:
@@ -129,14 +94,12 @@ class Evaluator:
         self._cross = None if term is None or inducing is None else term.cross(params, inducing)
         samples = 0 if self._cross is None else self._cross.size
         self._outputs = np.array(outputs, dtype=np.int64)
-        means, variances = _linear_prior(linear, params)
-        _check(self._outputs, samples * n, weights, root, len(means))
+        check_factors(self._outputs, samples * n, weights, root, len(prior_variances(linear, params)))
+        regressors = [each.regressor() for each in linear]
         self._fills, self._fills_many, self._residual = [], [], None
         self._payload = slice(0, 0)
-        self._gravity: list[_GravityTerm] = []
         first = 0
-        for kernel in linear:
-            regressor = kernel.regressor()
+        for kernel, regressor in zip(linear, regressors, strict=True):
             last = first + regressor.size
             if isinstance(kernel, ResidualKernel):
                 self._residual = first, kernel
@@ -145,17 +108,16 @@ class Evaluator:
                 self._fills_many.append((first, regressor.fill_many, isinstance(kernel, DriveKernel | PayloadKernel)))
             if isinstance(kernel, PayloadKernel):
                 self._payload = slice(first, last)
-            if (places := _gravity_places(kernel, first, last)) is not None:
-                self._gravity.append(_GravityTerm(places, first, last, regressor.fill, regressor.fill_many))
             first = last
         if self._residual is not None and term is not None:
             raise ValueError("linear has a residual beside a nonlinear term, expected one of them")
-        parts = _of_joints(linear) if term is None else []
+        self._gravity = Gravity(linear, regressors)
+        parts = weights_of_joints(linear) if term is None else []
         self._counts = np.array([len(each) for each in parts], np.int64)
         self._places = np.zeros((len(parts), self._counts.max(initial=0)), np.int64)
         for row, each in zip(self._places, parts, strict=True):
             row[: len(each)] = each
-        self._fixed = _lay_out(weights, root, means, variances, parts)
+        self._fixed = pack_factors(*feature_factors(linear, params, weights, root), len(self._outputs), parts)
         self._std_factor = float(std_factor)
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
@@ -168,7 +130,7 @@ class Evaluator:
         self._usual_mean: Array = np.zeros(n) if usual is None else usual[0]
         self._usual: Array = np.full(n, np.inf) if usual is None else usual[1]
         self._stood = np.zeros(n, np.bool_) if stood is None else stood
-        sizes = samples, len(self._outputs) + len(means), len(means), n
+        sizes = samples, len(weights), first, n
         self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
 
     @property
@@ -216,12 +178,10 @@ class Evaluator:
         are those of `many`, to the last bit.
         """
         scratch, what = self._one, STD if std or self._falls_back else MEAN
-        # slicing would cost as much as the arithmetic
-        query, deflected, blocks, features, prior, work, memory, own, share = scratch.of_one
+        (blocks, features, prior, _), between = scratch.work, scratch.covariance
         if covariance is not None:
-            work, what = covariance, COVARIANCE
-        if len(motion) > POSITIONS:
-            query = deflected
+            between, what = covariance, COVARIANCE
+        query = scratch.deflected if len(motion) > POSITIONS else scratch.motions
         query[0] = motion
         if self._cross is not None:
             self._cross.fill_many(query, blocks)
@@ -230,59 +190,13 @@ class Evaluator:
         for first, last, fill in self._fills:
             fill(query[0], features[0, first:last])
         tau = np.empty((1, self.n_joints))
-        deviation = np.empty((1, self.n_joints)) if std else own
-        doubtful = answer_one(
-            self._fixed,
-            self._outputs,
-            self._places,
-            self._counts,
-            blocks,
-            features,
-            prior[1],
-            self._std_factor,
-            self._floor,
-            self._misfit,
-            SIGN_WIDTH,
-            self._usual,
-            query,
-            what,
-            memory,
-            tau,
-            deviation,
-            work,
-            share,
-        )
-        if self._residual is not None:
-            tau += prior[0]
-        fallback = share[0].copy() if doubtful else None
+        deviation = np.empty((1, self.n_joints)) if std else scratch.std
+        doubtful = self._solve(answer_one, what, query, scratch.work, tau, deviation, between, scratch.share)
+        fallback = scratch.share[0].copy() if doubtful else None
         if reduced is not None:
-            scratch.still[0, 0] = motion[0]
-            for each in self._gravity:
-                each.fill(scratch.still[0], scratch.gravity[0, each.first : each.last])
-                features[0, each.places] -= scratch.gravity[0, each.places]
-            answer_one(
-                self._fixed,
-                self._outputs,
-                self._places,
-                self._counts,
-                blocks,
-                features,
-                prior[1],
-                self._std_factor,
-                self._floor,
-                self._misfit,
-                SIGN_WIDTH,
-                self._usual,
-                query,
-                STD,
-                memory,
-                reduced[:1],
-                reduced[1:],
-                scratch.covariance,
-                share,
-            )
-            if self._residual is not None:
-                reduced[0] += prior[0, 0]
+            self._gravity.subtract_one(query[0], features[0])
+            outputs = reduced[:1], reduced[1:], scratch.covariance, scratch.share
+            self._solve(answer_one, STD, query, scratch.work, *outputs)
         return tau[0], deviation[0] if std else None, fallback
 
     def many(
@@ -299,19 +213,10 @@ class Evaluator:
         doubtful = list[bool]()
 
         def answer_part(part: slice) -> None:
-            scratch, doubtful_part = self._many, False
-            for start in range(part.start, part.stop, QUERIES):
-                rows = slice(start, min(start + QUERIES, part.stop))
-                count = rows.stop - start
-                motions = (scratch.motions if deflections is None else scratch.deflected)[:count]
-                for place, values in enumerate((q, dq, ddq)):
-                    motions[:, place] = values[rows]
-                if deflections is not None:
-                    motions[:, POSITIONS:] = deflections[rows]
-                work = scratch.covariance[:count] if covariances is None else covariances[rows]
-                what = STD if covariances is None else COVARIANCE
-                doubtful_part |= self._answer(scratch, motions, motions, what, tau[rows], std[rows], work, share[rows])
-            doubtful.append(doubtful_part)
+            known = None if deflections is None else deflections[part]
+            for rows, motions in _groups(Motion(q[part], dq[part], ddq[part], known).arrays(), part.start):
+                between = None if covariances is None else covariances[rows]
+                doubtful.append(self._answer(motions, motions, tau[rows], std[rows], share[rows], between))
 
         run_parts(size, answer_part)
         return tau, std, covariances, share if any(doubtful) else None
@@ -323,15 +228,10 @@ class Evaluator:
         difference are the difference of the features. Misfit and variance beyond a residual count in full: their share
         in gravity is unknown. Only without a nonlinear term. motions: as of `Motion.arrays`.
         """
-        scratch, (size, _, n) = self._many, motions.shape
-        tau, std = np.empty((size, n)), np.empty((size, n))
-        for start in range(0, size, QUERIES):
-            moving = np.ascontiguousarray(motions[start : start + QUERIES])
-            rows, count = slice(start, start + len(moving)), len(moving)
-            still = scratch.still[:count]
-            still[:, 0] = moving[:, 0]
-            outputs = STD, tau[rows], std[rows], scratch.covariance[:count], scratch.share[:count]
-            self._answer(scratch, moving, moving, *outputs, still)
+        tau, std = np.empty_like(motions[:, 0]), np.empty_like(motions[:, 0])
+        for rows, moving in _groups(motions):
+            share = self._many.share[: len(moving)]
+            self._answer(moving, moving, tau[rows], std[rows], share, with_gravity=False)
         return tau, std
 
     def fall_back(self, motions: Array, tau: Array, share: Array) -> Array:
@@ -344,18 +244,14 @@ class Evaluator:
         """
         scratch, harmless = self._many, np.empty_like(tau)
         slopes = self._slopes[self._payload]
-        for start in range(0, len(tau), QUERIES):
-            moving = np.ascontiguousarray(motions[start : start + QUERIES])
-            rows, count = slice(start, start + len(moving)), len(moving)
-            still = scratch.motions[:count]
-            still[:, 0], still[:, 1:] = moving[:, 0], 0.0
-            static, own = harmless[rows], scratch.share[:count]
-            outputs = STD, static, scratch.std[:count], scratch.covariance[:count], own
+        for rows, moving in _groups(motions):
+            still, static, count = at_rest(moving), harmless[rows], len(moving)
+            std, own = scratch.std[:count], scratch.share[:count]
             gravity, without = np.zeros_like(static), np.ones_like(static)
             if self._stood.any():
-                self._answer(scratch, still, still, *outputs)
+                self._answer(still, still, static, std, own)
                 gravity[:, self._stood], without[:, self._stood] = static[:, self._stood], own[:, self._stood]
-            self._answer(scratch, still, moving, *outputs)
+            self._answer(still, moving, static, std, own)
             payload = np.einsum("p,kpj->kj", slopes, scratch.features[:count, self._payload])
             rest = (1.0 - without) * gravity + without * (self._usual_mean + payload)
             static[:] = (1.0 - own) * static + own * rest
@@ -375,18 +271,16 @@ class Evaluator:
 
     def _answer(
         self,
-        scratch: _Scratch,
         motions: Array,
         moving: Array,
-        what: int,
         tau: Array,
         std: Array,
-        covariance: Array,
         share: Array,
-        still: Array | None = None,
+        covariance: Array | None = None,
+        with_gravity: bool = True,
     ) -> bool:
-        """Compute N queries. moving: their motion for friction and payload; still: motion to subtract gravity of."""
-        count = len(motions)
+        """Compute at most QUERIES queries. moving: their motion for friction and payload."""
+        scratch, count = self._many, len(motions)
         blocks, features, prior = scratch.blocks[:count], scratch.features[:count], scratch.prior[:, :count]
         if self._cross is not None:
             self._cross.fill_many(motions, blocks)
@@ -394,11 +288,27 @@ class Evaluator:
             self._residual[1].fill_all(motions, features, self._residual[0], prior[0], prior[1])
         for first, fill_many, moves in self._fills_many:
             fill_many(moving if moves else motions, features, first)
-        if still is not None:
-            for each in self._gravity:
-                each.fill_many(still, scratch.gravity[:count], each.first)
-                features[:, each.places] -= scratch.gravity[:count, each.places]
-        doubtful = answer(
+        if not with_gravity:
+            self._gravity.subtract(motions, features)
+        what = STD if covariance is None else COVARIANCE
+        between = scratch.covariance[:count] if covariance is None else covariance
+        work = blocks, features, prior, scratch.memory
+        return self._solve(answer, what, motions, work, tau, std, between, share)
+
+    def _solve(
+        self,
+        solve: Callable[..., bool],
+        what: int,
+        motions: Array,
+        work: tuple[Array, Array, Array, Array],
+        tau: Array,
+        std: Array,
+        covariance: Array,
+        share: Array,
+    ) -> bool:
+        """Compute torques from features; see `answer`. work: of `_Scratch`."""
+        blocks, features, prior, memory = work
+        doubtful = solve(
             self._fixed,
             self._outputs,
             self._places,
@@ -413,7 +323,7 @@ class Evaluator:
             self._usual,
             motions,
             what,
-            scratch.memory,
+            memory,
             tau,
             std,
             covariance,
@@ -424,53 +334,8 @@ class Evaluator:
         return doubtful
 
 
-def _gravity_places(kernel: LinearKernel, first: int, last: int) -> slice | Indices | None:
-    """Return the places of a term's features that contain gravity, among those of all linear terms; None if none do."""
-    if isinstance(kernel, DriveKernel):
-        gains = first + np.flatnonzero(kernel.gains)
-        return gains if len(gains) else None
-    return None if isinstance(kernel, ResidualKernel | MixtureKernel) else slice(first, last)
-
-
-def _linear_prior(linear: Sequence[LinearKernel], params: Params) -> tuple[Array, Array]:
-    """Return the prior means and variances of all linear weights, term after term, (P,) each."""
-    means, variances = [np.zeros(0)], [np.zeros(0)]
-    for term in linear:
-        variance, mean = term.variances(params), term.prior_weights()
-        means.append(np.zeros(len(variance)) if mean is None else mean)
-        variances.append(variance)
-    return np.concatenate(means), np.concatenate(variances)
-
-
-def _check(outputs: Indices, torques: int, weights: Array, root: Array, linear_weights: int) -> None:
-    """Raise ValueError if shapes do not match, an output is not one of `torques`, or root is not lower triangular."""
-    size = len(outputs) + linear_weights
-    if outputs.ndim != 1 or np.any((outputs < 0) | (outputs >= torques)):
-        raise ValueError(f"outputs are {outputs}, expected numbers from 0 to {torques - 1}")
-    if size == 0:
-        raise ValueError("there are no outputs and no linear weights, expected at least one of them")
-    if weights.shape != (size,):
-        raise ValueError(f"weights have shape {weights.shape}, expected ({size},)")
-    if root.shape != (size, size):
-        raise ValueError(f"root has shape {root.shape}, expected ({size}, {size})")
-    if np.any(np.triu(root, 1)):
-        raise ValueError("root has elements above the diagonal, expected a lower triangular matrix")
-
-
-def _of_joints(linear: Sequence[LinearKernel]) -> list[Indices]:
-    """Return the places among all linear weights of those that each joint's torque may depend on."""
-    first = np.cumsum([0, *(each.regressor().size for each in linear)])
-    of_term = list(zip(first, linear, strict=False))
-    return [np.concatenate([at + each.of_joint(j) for at, each in of_term]) for j in range(linear[0].n_joints)]
-
-
-def _lay_out(weights: Array, root: Array, means: Array, variances: Array, parts: list[Indices]) -> Array:
-    """Return the `fixed` array of `answer`, for features Φᵀ instead of their covariances Λ Φᵀ."""
-    scale = np.ones(len(weights))
-    scale[len(scale) - len(variances) :] = variances
-    slopes = weights * scale
-    slopes[len(scale) - len(means) :] += means
-    root, chosen = root * scale, len(weights) - len(variances)
-    # rows of a panel have the same sign
-    panels = [pack(root[:chosen], 0), pack(root[chosen:], chosen)]
-    return np.concatenate([pack(slopes[None], len(slopes)), *panels, pack_joints(slopes, root, parts)])
+def _groups(motions: Array, first: int = 0) -> Iterator[tuple[slice, Array]]:
+    """Return at most QUERIES motions at a time, with their rows. first: row of the first motion."""
+    for start in range(0, len(motions), QUERIES):
+        group = np.ascontiguousarray(motions[start : start + QUERIES])
+        yield slice(first + start, first + start + len(group)), group
