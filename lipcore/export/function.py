@@ -13,7 +13,8 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array, Motion
-from lipcore.kernels.base import State, constant, reordered
+from lipcore.kernels.arrays import constant, reordered
+from lipcore.kernels.base import State
 from lipcore.kernels.drive.play import element_widths
 from lipcore.kernels.fast.answer import root_of_part
 from lipcore.model.torque_model import TorqueModel

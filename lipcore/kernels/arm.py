@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS, Arm
-from lipcore.kernels.base import LinearKernel, Params, Regressor, State, constant, on_diagonal, reordered
+from lipcore.kernels.arrays import constant, on_diagonal, reordered
+from lipcore.kernels.base import LinearKernel, Params, Regressor, State
 from lipcore.kernels.fast.arm import (
     arm_energies,
     arm_queries,

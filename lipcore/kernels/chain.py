@@ -21,7 +21,8 @@ from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion, check_joint_types
-from lipcore.kernels.base import Params, State, of_all_joints, on_diagonal
+from lipcore.kernels.arrays import of_all_joints, on_diagonal
+from lipcore.kernels.base import Params, State
 from lipcore.kernels.energy import (
     PRIOR_STD,
     initial_weights,

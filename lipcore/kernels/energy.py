@@ -12,7 +12,8 @@ from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array
-from lipcore.kernels.base import Params, State, on_diagonal
+from lipcore.kernels.arrays import on_diagonal
+from lipcore.kernels.base import Params, State
 from lipcore.kernels.polynomial import Product
 
 

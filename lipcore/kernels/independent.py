@@ -14,7 +14,8 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array, Motion, check_joint_types
-from lipcore.kernels.base import PairKernel, Params, State, on_diagonal
+from lipcore.kernels.arrays import on_diagonal
+from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.vocabulary import JointType
 
 

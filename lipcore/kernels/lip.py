@@ -8,7 +8,8 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array, Motion, check_joint_types
-from lipcore.kernels.base import Params, State, of_all_joints
+from lipcore.kernels.arrays import of_all_joints
+from lipcore.kernels.base import Params, State
 from lipcore.kernels.energy import (
     PRIOR_STD,
     initial_weights,

@@ -25,7 +25,8 @@ from array_api_compat import array_namespace, device
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion, check_joint_types
-from lipcore.kernels.base import PairKernel, Params, State, on_diagonal
+from lipcore.kernels.arrays import on_diagonal
+from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.independent import per_joint, power, spread
 from lipcore.vocabulary import JointType
 

@@ -11,7 +11,8 @@ from array_api_compat import array_namespace
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative, Arm
-from lipcore.kernels.base import LinearKernel, Params, Regressor, State, constant, reordered
+from lipcore.kernels.arrays import constant, reordered
+from lipcore.kernels.base import LinearKernel, Params, Regressor, State
 from lipcore.kernels.fast.arm import arm_differences
 from lipcore.kernels.newton_euler import rigid_body_torque
 

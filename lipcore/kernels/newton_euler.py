@@ -16,7 +16,8 @@ import numpy as np
 from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array
-from lipcore.kernels.base import State, constant
+from lipcore.kernels.arrays import constant
+from lipcore.kernels.base import State
 from lipcore.kernels.geometry import Geometry
 
 Spatial = tuple[Array, Array]

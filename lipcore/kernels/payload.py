@@ -7,7 +7,8 @@ import numpy as np
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Arm
-from lipcore.kernels.base import LinearKernel, Params, Regressor, State, reordered
+from lipcore.kernels.arrays import reordered
+from lipcore.kernels.base import LinearKernel, Params, Regressor, State
 from lipcore.kernels.fast.arm import arm_energies
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.fast.payload import payload_queries, payload_query, payload_size

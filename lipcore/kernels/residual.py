@@ -10,7 +10,8 @@ from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion
-from lipcore.kernels.base import LinearKernel, Params, Regressor, constant, on_last_diagonal
+from lipcore.kernels.arrays import constant, on_last_diagonal
+from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import pack
 from lipcore.kernels.fast.lanes import LANES

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.base import LinearKernel, Params, TorqueKernel, on_last_diagonal
+from lipcore.kernels.arrays import on_last_diagonal
+from lipcore.kernels.base import LinearKernel, Params, TorqueKernel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.exact import Posterior, Prediction
 from lipcore.posterior.layout import feature_factors

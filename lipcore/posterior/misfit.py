@@ -14,7 +14,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.repetition import measure_distinct_share
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
-from lipcore.kernels.base import constant
+from lipcore.kernels.arrays import constant
 from lipcore.kernels.drive.play import deflections_of
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.fast.answer import ACCELERATED, MISFIT_ROWS

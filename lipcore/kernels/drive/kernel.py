@@ -10,7 +10,8 @@ from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.base import LinearKernel, Params, PartialKernel, Regressor, State, constant, on_diagonal, reordered
+from lipcore.kernels.arrays import constant, on_diagonal, reordered
+from lipcore.kernels.base import LinearKernel, Params, PartialKernel, Regressor, State
 from lipcore.kernels.drive.play import deflections_of
 from lipcore.kernels.drive.terms import (
     SHAPE_SPEEDS,

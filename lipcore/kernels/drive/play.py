@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
-from lipcore.kernels.base import constant
+from lipcore.kernels.arrays import constant
 from lipcore.kernels.fast.play import CERTAIN_SHARE, POSITIONS, follow
 
 ELEMENTS = (1e-3, 3e-3, 1e-2, 3e-2, 1e-1)

@@ -20,7 +20,7 @@ from lipcore.estimators.catalogue import (
     make_estimator,
 )
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.kernels.base import on_last_diagonal
+from lipcore.kernels.arrays import on_last_diagonal
 from lipcore.model import dynamics
 from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
 from lipcore.posterior.exact import negative_log_evidence
