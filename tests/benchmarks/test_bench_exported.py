@@ -7,7 +7,7 @@ from rich.console import Console
 
 from benchmarks.exported.running import SHIPPED, Options, grids, run, targets
 from benchmarks.workload import BenchError
-from tests.lipcore.export.test_c_writer import needs_compiler
+from tests.lipcore.export.compiled import needs_compiler
 
 pytestmark = pytest.mark.slow
 

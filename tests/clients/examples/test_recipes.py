@@ -13,7 +13,7 @@ import lipcore
 from tests import ROOT
 from tests.clients.examples.recipes import EXAMPLES, STUBS, Law, build, move_and_return, play
 from tests.docs.test_pages import parse
-from tests.lipcore.export.test_c_writer import train_arm
+from tests.lipcore.export.models import train_arm
 
 JOINTS = [f"panda_joint{k}" for k in range(1, 8)]
 POSTURE = np.array([0.1, -0.1, 0.0, -1.8, 0.2, 1.6, 0.3])

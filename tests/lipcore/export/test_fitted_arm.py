@@ -14,7 +14,7 @@ from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.model.parameters import report
 from lipcore.model.plausible import is_plausible, nearest_plausible
 from tests.lipcore.arms import random_bodies
-from tests.lipcore.export.test_c_writer import PANDA, train_arm, with_drive
+from tests.lipcore.export.models import PANDA, train_arm, with_drive
 
 
 def arm_of(model: TorqueModel) -> SimulatedArm:

@@ -15,7 +15,7 @@ from lipcore.export.function import function
 from lipcore.kernels.drive.play import PlayState, element_widths
 from tests.choosing import few
 from tests.lipcore.arm_oracles import arm, record_motion
-from tests.lipcore.export.test_c_writer import MODELS, draw_motions
+from tests.lipcore.export.models import MODELS, draw_motions
 from tests.lipcore.oracles import central_difference
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen", max_iterations=3, starts=1, max_inducing_outputs=20)

@@ -18,7 +18,7 @@ from lipcore.export.origin import ModelOrigin
 from lipcore.extras import MissingExtraError
 from lipcore.vocabulary import ROBOT_ESTIMATORS, ExportFormat
 from tests.choosing import slow
-from tests.lipcore.export.test_c_writer import MODELS, draw_motions
+from tests.lipcore.export.models import MODELS, draw_motions
 from tests.lipcore.export.test_function import ALL, ESTIMATORS, train_estimator
 from tests.lipcore.oracles import central_difference
 

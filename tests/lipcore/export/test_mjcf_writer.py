@@ -22,7 +22,7 @@ from lipcore.robots.simulation import Simulation, inverse_dynamics, sinusoids
 from lipcore.robots.urdf import RigidBody
 from tests.choosing import few
 from tests.lipcore.arms import parameters, parameters_of, random_bodies, random_geometry
-from tests.lipcore.export.test_c_writer import MODELS, PANDA, train_arm, with_drive
+from tests.lipcore.export.models import MODELS, PANDA, train_arm, with_drive
 from tests.lipcore.robots.test_urdf import joints, torque_of_urdf, training_range
 
 mujoco = pytest.importorskip("mujoco", reason="needs the module mujoco, of the extra test")

@@ -10,7 +10,7 @@ from lipcore.kernels.drive.play import ELEMENTS
 from lipcore.posterior import threads
 from lipcore.posterior.batch_mean import BatchMean
 from tests.choosing import few
-from tests.lipcore.export.test_c_writer import MODELS, PANDA, draw_motions
+from tests.lipcore.export.models import MODELS, PANDA, draw_motions
 
 KEPT = ("panda", "local", "energies", "friction of all kinds, alternatives")
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from lipcore.data.samples import Array
-from tests.lipcore.export.test_c_writer import compile_library, draw_motions, evaluate_library, needs_compiler
+from tests.lipcore.export.compiled import compile_library, evaluate_library, needs_compiler
+from tests.lipcore.export.models import draw_motions
 from tests.service.data import error, service_of
 from tests.service.models.archives.packing import exported, unpack
 from tests.service.models.versions import publish, publish_arm, trained_model
