@@ -29,7 +29,7 @@ from service.foundation.errors import InvalidDataError, invalid_data, invalid_re
 SAMPLE_BYTES = 512 * 1024
 """Bytes at the start of a file that show its layout."""
 DIALECT_CHARS = 16 * 1024
-"""Max characters that CleverCSV reads."""
+"""Max characters that CleverCSV reads. The time that it takes grows with the square of the longest word."""
 MAX_LINE_BYTES = 1024 * 1024
 """Max length of a line; also the size of the blocks that are parsed."""
 DELIMITERS = (",", ";", "\t", "|", " ")
@@ -94,11 +94,12 @@ def _find_dialect(lines: Sequence[str]) -> tuple[str, str]:
             break
         chars += len(line)
         some.append(line)
-    found = clevercsv.Detector().detect("".join(some).replace("\0", ""), delimiters=DELIMITERS)
+    sample = "".join(some)[:DIALECT_CHARS]  # the first line may be longer
+    found = clevercsv.Detector().detect(sample.replace("\0", ""), delimiters=DELIMITERS)
     if found is None:
         return ",", '"'
     delimiter, quote = found.delimiter or ",", found.quotechar or '"'
-    if delimiter == BLANK and '"' in "".join(some):  # lists in quoted cells have blanks, too
+    if delimiter == BLANK and '"' in sample:  # lists in quoted cells have blanks, too
         for other in DELIMITERS[:-1]:
             widths = {len(each.cells) for each in _split_records(lines, other, '"')}
             if len(widths) == 1 and widths != {1}:

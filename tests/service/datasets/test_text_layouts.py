@@ -3,6 +3,7 @@
 import bz2
 import gzip
 
+import clevercsv
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.datasets.formats.opening import open_table
+from service.datasets.formats.text import DIALECT_CHARS, read_layout
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, TooLargeError
 from tests.service.datasets.reading import check_rejected, read_rejected, settings_of, zipped
@@ -201,6 +203,15 @@ def test_rows_of_one_time_must_agree_in_time(tmp_path):
 def test_text_of_a_plc_program_is_named(tmp_path):
     body = b"n : UDINT := 2;\nq_1 : ARRAY[1..2] OF REAL := [-0.29, -0.28];\n"
     check_rejected(tmp_path, body, "csv", "file", "PLC")
+
+
+def test_separator_is_found_in_the_first_characters_of_a_long_line(tmp_path, monkeypatch):
+    read = []
+    monkeypatch.setattr(clevercsv.Detector, "detect", lambda _, text, **options: read.append(text))
+    path = tmp_path / "long.csv"
+    path.write_text("t," + "x" * 2 * DIALECT_CHARS)
+    read_layout(path, None)
+    assert [len(text) for text in read] == [DIALECT_CHARS]
 
 
 @given(data=st.data())
