@@ -1,4 +1,4 @@
-"""A program of single operations as C: the statements of a function."""
+"""C statements of a function, from a program of single operations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lipcore.kernels.joint_frames import links_of, torque
 QUERY = ("q", "dq", "ddq", "sine", "cosine")
 """Fields of `query_t` that torque depends on."""
 LONGEST = 300
-"""Characters of an expression from which it is a statement of its own."""
+"""Length above which an expression becomes a statement of its own, characters."""
 PAYLOAD = 10
 
 
@@ -69,7 +69,7 @@ def _query_texts(n: int) -> list[str]:
 
 
 def _statements(results: dict[str, Number], inputs: Sequence[str]) -> str:
-    """Return statements that assign the results by name. Operations that are used once are parts of expressions."""
+    """Return statements that assign the results by name. Operations used once become parts of expressions."""
     program = Program.of(list(results.values()))
     inputs = [*inputs, *[""] * (program.inputs - len(inputs))]  # those that no result needs
     uses = Counter(place for each in program.operations for place in each.arguments)

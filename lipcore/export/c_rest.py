@@ -1,4 +1,4 @@
-"""The torque beside rigid bodies as tables for C: for `energy.c.in` and `residual.c.in`.
+"""Tables for C of the terms beside rigid bodies: energies (`energy.c.in`), local correction (`residual.c.in`).
 
 Torques of such a term have the covariances c with m torques of inducing samples. They add αᵀ c to the mean and k₁ − |Q₁
 c|² to the variance. Q₂ c is added to the product of the weights' features and their deviations, see `CompactPosterior`.
@@ -88,7 +88,7 @@ def correction_tables(residual: ResidualKernel, posterior: CompactPosterior) -> 
 def _energy(term: ChainKernel, params: Params, motion: Motion) -> dict[str, Array]:
     """Return the tables of energies.
 
-    Shares of each joint's kernel, scales: (n,); weights: (n, n); samples: (G, 6, n, LANES), of
+    They are: shares of each joint's kernel, and scales, (n,) each; weights, (n, n); samples, (G, 6, n, LANES), see
     `lipcore.kernels.fast.joints.read_rows`.
     """
     shares, scales, weights = term.hyper(params)

@@ -44,7 +44,7 @@ WIDE = 8
 VECTORS = SELF_TEST_STATES
 """Queries of the self-test, half of them with PAYLOAD. Every second one has a state after TRAIL."""
 TRAIL = (0.3, -0.5, 0.004, 0.0)
-"""Positions before a query, relative to its own, in units of the largest element. They deflect every element partly."""
+"""Positions before a query, relative to the query's, in widths of the largest element. Every element deflects partly."""
 PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
 """Payload in half of the queries of the self-test."""
 
@@ -218,7 +218,7 @@ def _panels(root: Array) -> Array:
 
 
 def _full_panels(matrix: Array) -> Array:
-    """Return the matrix' rows, WIDE at a time, column by column: flat, padded with zeros."""
+    """Return the rows of a matrix, WIDE at a time, column by column: flat, padded with zeros."""
     padded = np.pad(matrix, ((0, -len(matrix) % WIDE), (0, 0)))
     return padded.reshape(-1, WIDE, padded.shape[1]).transpose(0, 2, 1).reshape(-1)
 

@@ -1,9 +1,9 @@
 """The arm of a simulator with the torque nearest to a model's.
 
-A simulator knows bodies, rotors, viscous and Coulomb friction. Their coefficients in a model are best together with the
-terms that a simulator lacks (Stribeck friction, friction that grows with load, play, a correction), and learnt rotors
-and friction may be negative. So all coefficients are fitted again, together: least squares over the torque in the range
-of the training, subject to bodies that can exist, and rotors and friction of at least zero.
+A simulator has bodies, rotors, viscous and Coulomb friction. A model has more terms: Stribeck friction, friction that
+grows with load, play, a correction. Without these, its coefficients of bodies and friction are not the best ones.
+Learnt rotors and friction may also be negative. So all coefficients are fitted again, by least squares over the torque
+in the range of the training. Bodies have to be possible; rotors and friction have to be at least zero.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from lipcore.robots.urdf import PARAMETERS
 STATES = 1000
 """States of the fit: one half in the region of the training's motion, one half anywhere in its range."""
 RIDGE = 1e-2
-"""Weight of a change by one prior standard deviation, relative to an error of one state as large as the torque: that of
-errors of 10 % of the torque. On nine models of real and simulated arms, 1e-3 had the same errors, and larger masses."""
+"""Weight of a change by one prior standard deviation: it counts like an error of 10 % of the torque at one state. On
+nine models of real and simulated arms, 1e-3 had the same errors, and larger masses."""
 MAX_DENSITY = 1e4
 """Max density of a body, kg/m³: steel has 7 900. No body has smaller moments than a ball of this density."""
 PASSES = 6
-"""Max number of fits, each with bodies of the size that the masses of the one before need."""
+"""Max number of fits. The min size of the bodies follows from the masses of the previous fit."""
 MIN_SHARE = 0.01
 """Min torque of a joint relative to the largest one: smaller errors do not matter."""
 BARRIER = 1e-5
-"""Last barrier, in squared errors relative to the torque. A coefficient that wants to be zero becomes about 1e-4 of its
-scale. Errors of the same nine models were equal from 1e-8 to 1e-3."""
+"""Last barrier, in squared errors relative to the torque. A coefficient whose best value is zero becomes about 1e-4 of
+its scale. Errors of the same nine models were equal from 1e-8 to 1e-3."""
 
 
 def fit_arm(model: TorqueModel, arm: SimulatedArm) -> SimulatedArm:
@@ -104,7 +104,7 @@ def _geometries(term: ArmKernel, arm: SimulatedArm, mean: Array) -> list[Geometr
 
 
 def _own_terms(motion: Motion, order: Indices) -> Array:
-    """Return what multiplies rotor, viscous and Coulomb friction at N motions, (3, N, n), base to tip."""
+    """Return the features of rotor, viscous and Coulomb friction at N motions, (3, N, n), base to tip."""
     parts = [motion.ddq, motion.dq, np.tanh(motion.dq / SIGN_WIDTH)]
     return np.stack(parts)[:, :, order]
 

@@ -21,7 +21,7 @@ from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, Export
 
 Writer = Callable[[TorqueModel, Mapping[str, Any], ModelOrigin], dict[str, bytes]]
 """Returns files by path. The second argument is `parameters` of the model's manifest. Raises ValueError for a model
-that the format cannot express, MissingExtraError."""
+that the format cannot express, and MissingExtraError if the format's library is missing."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """A model as one pure function of the array API: torque and its standard deviation at a batch of states.
 
 NumPy, PyTorch and JAX compute it from the formulas of `lipcore/kernels`, so it can be compiled, differentiated and
-mapped by them. The compiled answers of a service equal it, except that it never falls back: if the training does not
-determine a torque, its standard deviation is large.
+mapped by them. It returns what the compiled code of a service returns, but it never falls back: if the training does
+not determine a torque, the standard deviation is large.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class TorqueFunction:
     def drive_step(self, q: Array, drive_state: Array) -> Array:
         """Return the drive's state after a motion to q, (..., 1 + 2 K, n).
 
-        q: (..., n). Steps are small: an element follows the sum of a step, not its way.
+        q: (..., n). Use small steps: an element does not follow motion to and fro within one step.
         """
         xp, widths = array_namespace(q), constant(np.tile(self._widths, (2, 1)), q)
         step = (q - drive_state[..., 0, :])[..., None, :] / widths

@@ -175,7 +175,7 @@ class Graph:
         return self.node("Where", np.where(condition.value, one.value, other.value), condition, one, other)
 
     def pair(self, kind: str, compute: Callable[..., Any], one: Any, other: Any) -> Traced:
-        """Return the result of a node of two arrays that broadcast. A sum with zero is no node, nor a product."""
+        """Return the result of a node of two arrays that broadcast. Sums and products with zero need no node."""
         one, other = self.asarray(one), self.asarray(other)
         value = compute(one.value, other.value)
         rest: Traced

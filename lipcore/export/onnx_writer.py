@@ -22,9 +22,9 @@ from lipcore.model.torque_model import TorqueModel
 OPSET, IR_VERSION = 18, 9
 """Versions that onnxruntime runs since 1.17."""
 BATCHES = (1009, 1013, 1019)
-"""Example lengths of a batch, primes: a model has no axis of at least one of them."""
+"""Example lengths of a batch. At least one of these primes is not the length of another axis."""
 MAX_BATCH = 65536
-"""Largest batch that Triton sends; it may collect smaller requests."""
+"""Largest batch that Triton sends; it may merge smaller requests."""
 
 README = """\
 # {stem}

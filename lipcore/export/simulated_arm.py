@@ -1,4 +1,4 @@
-"""An arm as simulators know it: rigid bodies, rotors, viscous and Coulomb friction, shared by URDF and MJCF."""
+"""An arm as simulators describe it: rigid bodies, rotors, viscous and Coulomb friction, shared by URDF and MJCF."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def upright(gravity: Array) -> Array:
 
 
 def gravity_comments(geometry: Geometry) -> list[str]:
-    """Return what a reader has to know about gravity."""
+    """Return comments about gravity and the orientation of the base."""
     strength = float(np.linalg.norm(geometry.gravity))
     if strength == 0.0:
         return ["Torque was measured without gravity: the orientation of the base is unknown."]

@@ -1,8 +1,8 @@
 """Formulas as programs of single operations: run a formula once on `Number` objects, and read what it computed.
 
-Numbers calculate like floats, alone or in NumPy arrays of objects, so that a formula in the array API applies to them.
-Constants are computed at once; sums with zero, products with zero or one and double signs vanish; equal operations are
-one. `Program` contains the operations that its results need, each after its arguments.
+A `Number` calculates like a float, alone or in a NumPy array of objects. So a formula in the array API accepts it.
+Constants are computed at once. Sums with zero, products with zero or one, and double signs are removed. Equal
+operations become one. `Program` contains the operations that its results need, each after its arguments.
 
 Example:
     >>> graph = Graph()
@@ -41,12 +41,12 @@ class Graph:
         self._inputs = 0
 
     def inputs(self, count: int) -> list[Number]:
-        """Return further inputs of the program."""
+        """Add inputs to the program and return them."""
         first, self._inputs = self._inputs, self._inputs + count
         return [self.number(INPUT, place) for place in range(first, first + count)]
 
     def number(self, name: str, *arguments: Any) -> Number:
-        """Return the result of an operation of nodes, an input of a place, or a constant of a value."""
+        """Return the number of a node: an operation on nodes, an input with its place, or a constant with its value."""
         node = (name, *arguments)
         place = self._places.setdefault(node, len(self.nodes))
         if place == len(self.nodes):
@@ -96,7 +96,7 @@ class Number:
         return self._unary("fabs")
 
     def sin(self) -> Number:
-        """Return the sine; this and the next are what NumPy calls for arrays of objects."""
+        """Return the sine. NumPy calls this method, and those below, for arrays of objects."""
         return self._unary("sin")
 
     def cos(self) -> Number:
@@ -137,7 +137,7 @@ def _of(graph: Graph, value: Any) -> Number:
 
 
 def _negated(number: Number) -> Number | None:
-    """Return x of a number that is −x, or None."""
+    """Return x if the number is −x, else None."""
     name, *arguments = number.node
     return Number(number.graph, arguments[0]) if name == "negative" else None
 

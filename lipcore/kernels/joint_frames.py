@@ -7,7 +7,7 @@ operations, see `lipcore.kernels.graph`. The frames are chosen so that most of t
 - the origin is where the axis comes closest to the one before, so that its place has two numbers;
 - masses on a joint's axis belong to the link before, so that a body has seven numbers.
 
-Each number has a change beside it, with a step of the geometry or of the bodies: see `Dual`.
+Each number is computed together with its change by a step of the geometry or of the bodies, see `Dual`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Link:
     phase: float
     """φ, rad."""
     tilt: Array
-    """Turn about x and y before the turn about z, (2,) rad; a change."""
+    """Turn about x and y before the turn about z, (2,) rad. It is a step: only its first order counts."""
     place: Pair
     """Origin in the frame before, (3,) m."""
     body: Pair
@@ -162,7 +162,7 @@ def _rates(turning: Any, turned: Any) -> list[list[Dual]]:
 
 
 def _into(link: Link, z: Any, vector: Any) -> list[Dual]:
-    """Return a vector of the frame before in the link's own."""
+    """Return a vector of the previous frame in the frame of the link."""
     sine, cosine = Dual(np.sin(link.angle)), Dual(np.cos(link.angle))
     x, y = vector[0], cosine * vector[1] + sine * vector[2]
     part = [x, y, cosine * vector[2] - sine * vector[1]]
@@ -171,7 +171,7 @@ def _into(link: Link, z: Any, vector: Any) -> list[Dual]:
 
 
 def _out_of(link: Link, z: Any, vector: Any) -> list[Dual]:
-    """Return a vector of the link's own frame in the frame before."""
+    """Return a vector of the frame of the link in the previous frame."""
     sine, cosine = Dual(np.sin(link.angle)), Dual(np.cos(link.angle))
     part = [z[1] * vector[0] - z[0] * vector[1], z[0] * vector[0] + z[1] * vector[1], vector[2]]
     x, y, last = _added(part, _cross(_tilt(link), part))
@@ -203,9 +203,9 @@ def _cross(one: Any, other: Any) -> list[Dual]:
 
 
 def _grouped(links: list[Link]) -> list[Link]:
-    """Return the links with all masses on a joint's axis moved to the link before: torque stays the same.
+    """Return the links with all masses on a joint's axis moved to the previous link. Torque stays the same.
 
-    Behind a joint that slides, these are the second moments.
+    At a prismatic joint, the second moments are moved instead.
     """
     grouped = list[Link]()
     added: Pair = np.zeros((4, 4)), np.zeros((4, 4))

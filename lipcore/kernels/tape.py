@@ -1,4 +1,4 @@
-"""A program of single operations for many queries: rows of a memory, and operations that pass over whole blocks."""
+"""A program of single operations, laid out to run for many queries at once."""
 
 from __future__ import annotations
 
@@ -20,14 +20,23 @@ class Tape:
     """A program of sums, differences and products, laid out for `fast.tape.run`. It is immutable."""
 
     codes: Indices
+    """(K, 5), see `fast.tape.run`."""
     factors: Array
+    """Constants."""
     results: Indices
+    """Rows of the results, (R,)."""
     inputs: int
+    """Number of inputs."""
     rows: int
+    """Number of rows of the memory."""
 
     @classmethod
     def of(cls, program: Program) -> Tape:
-        """Return the program with products that are used once inside sums, and with a row for each number in use."""
+        """Lay out a program.
+
+        A product that is used once, in a sum, becomes part of the sum. A row of memory is used again when its number
+        is no longer needed.
+        """
         first = program.inputs + len(program.constants)
         steps = _fused(program, first)
         last = {place: len(steps) for place in program.results}
@@ -79,7 +88,7 @@ def _fused(program: Program, first: int) -> list[tuple[int, int, tuple[int, ...]
 
 
 def _step(code: int, target: int, places: tuple[int, ...], constants: range) -> tuple[int, int, tuple[int, ...]]:
-    """Return a step; a constant is its y."""
+    """Return a step. If one of x and y is a constant, it becomes y."""
     if len(places) > 1 and places[0] in constants:
         code = tape.SUBTRACT_FROM if code == tape.SUBTRACT else code
         places = (places[1], places[0], *places[2:])

@@ -142,8 +142,8 @@ class Settings(BaseSettings):
     alarm_webhook_secret: SecretStr | None = Field(
         None,
         min_length=16,
-        description="Secret, at least 16 characters, that signs what is posted to LIPSERVE_ALARM_WEBHOOK. The client's "
-        "`read_alarm_event` checks the signature.",
+        description="Secret of at least 16 characters. Each request to LIPSERVE_ALARM_WEBHOOK is signed with it. The "
+        "client's `read_alarm_event` checks the signature.",
     )
 
     max_upload_bytes: Bytes = Field(256 * MiB, description="Max size of an uploaded recording.")
@@ -265,7 +265,7 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _webhook_signed(self) -> Self:
         if self.alarm_webhook is not None and self.alarm_webhook_secret is None:
-            raise ValueError("alarm_webhook needs alarm_webhook_secret, which signs what is posted")
+            raise ValueError("alarm_webhook needs alarm_webhook_secret, with which its requests are signed")
         return self
 
     @model_validator(mode="after")

@@ -1,7 +1,7 @@
 """Sends the events of alarms to the operator's webhook, at least once each, in a thread of its own.
 
-The events lie in the database. A sender claims one by moving its next attempt into the future, so that several services
-share the work and an event survives the end of any of them. It is deleted once the receiver has acknowledged it.
+Events are rows of the database. A sender claims an event by moving its next attempt into the future. So several
+services share the work, and no event is lost if one of them ends. An acknowledged event is deleted.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ logger = logging.getLogger(__name__)
 SIGNATURE = "LIPServe-Signature"
 """Header with the time of sending and the HMAC-SHA256 of time and body: `t=1767225600,v1=5f0c…`."""
 POLL_S = 1.0
-"""Seconds between two looks at the database, which other processes write to."""
+"""Seconds between two reads of the database. Other processes add events, too."""
 ANSWER_S = 10.0
-"""Seconds that a connection, and each part of an answer, may take."""
+"""Timeout of connecting, and of each part of an answer, s."""
 CLOSE_S = 2.0
-"""Seconds that a stopping service waits for an attempt that runs."""
+"""Seconds that a stopping service waits for a running attempt."""
 RETRY_S, MAX_RETRY_S = 30.0, 3600.0
-"""Seconds from the first attempt to the second, longer than an attempt lasts; doubled each time, and their max."""
+"""Seconds from the first attempt to the second. They double with each attempt up to a max. An attempt is shorter."""
 OUTCOMES = ("delivered", "failed", "dropped")
 
 
@@ -47,7 +47,7 @@ def sign(secret: str, body: bytes, at: int) -> str:
 
 
 class Webhook(Collector):
-    """The sender of one service, and its metrics. Without the setting it sends nothing.
+    """The sender of one service, and its metrics. It sends nothing if LIPSERVE_ALARM_WEBHOOK is not set.
 
     clock: Unix time, s.
     """
@@ -70,14 +70,14 @@ class Webhook(Collector):
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Start to send, in a thread."""
+        """Start the thread that sends."""
         if self._url is not None:
             logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs each request with its URL, often a secret
             self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
             self._thread.start()
 
     def close(self) -> None:
-        """Stop after the attempt that runs. Events that are left are sent after the next start."""
+        """Stop after the running attempt. The next start sends the events that are left."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
@@ -87,7 +87,7 @@ class Webhook(Collector):
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Yield every metric; without a webhook nothing waits."""
+        """Yield every metric. Without a webhook, the number of waiting events is zero."""
         yield self.sent.of(([outcome], count) for outcome, count in self._counts.items())
         waiting = 0
         if self._url is not None:
@@ -96,7 +96,7 @@ class Webhook(Collector):
         yield self.waiting.of([((), waiting)])
 
     def send_next(self) -> bool:
-        """Send the event that is due first; return whether the receiver has acknowledged one. Blocking."""
+        """Send the event that is due first. Return whether the receiver acknowledged it. The call blocks."""
         event = self._claim()
         if event is None:
             return False
@@ -110,11 +110,11 @@ class Webhook(Collector):
         return error is None
 
     def _claim(self) -> AlarmEventRow | None:
-        """Return the event that is due first, after moving its next attempt; drop those that are too old."""
+        """Return the event that is due first, and schedule its next attempt. Delete events that are too old."""
         moment = self._clock()
         first = select(AlarmEventRow).where(AlarmEventRow.due <= moment).order_by(AlarmEventRow.due, AlarmEventRow.seq)
         with self._database.session() as session:
-            if session.scalar(first.limit(1)) is None:  # writers do not wait for nothing
+            if session.scalar(first.limit(1)) is None:  # a transaction would block other writers
                 return None
         with self._database.transaction() as session:
             for row in session.scalars(first):
@@ -129,7 +129,7 @@ class Webhook(Collector):
         return row
 
     def _post(self, body: dict[str, Any]) -> str | None:
-        """Send one event; return why it failed, None if the receiver has acknowledged it."""
+        """Send one event. Return the reason of a failure, or None if the receiver acknowledged it."""
         import httpx  # noqa: PLC0415 - 20 MB that only a service with a webhook needs
 
         assert self._url is not None
@@ -158,7 +158,7 @@ class Webhook(Collector):
         while not self._ended.wait(pause):
             try:
                 pause = 0.0 if self.send_next() else POLL_S
-            except Exception:  # the database may be away for a while
+            except Exception:  # the database may be unreachable
                 if self._ended.is_set():
                     return
                 if pause < RETRY_S:  # once

@@ -1,4 +1,4 @@
-"""Exports of a model: each is a line of the audit log."""
+"""Exports of a model. Each export is a line of the audit log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.storage import audit
 from service.storage.database import AuditRow, Database
 
 MAX_LINES = 100
-"""Newest exports that are looked through for the last one of each format."""
+"""Number of newest exports that are searched for the last one of each format."""
 
 
 def note_export(database: Database, origin: ModelOrigin, kind: ExportFormat) -> None:
@@ -23,7 +23,7 @@ def note_export(database: Database, origin: ModelOrigin, kind: ExportFormat) -> 
 
 
 def list_exports(session: Session, model: str, version: int, revision: int) -> list[Export]:
-    """Return the last export of a model in each format, newest first. version, revision: those that serve."""
+    """Return the last export of a model in each format, newest first. version, revision: the serving ones."""
     query = select(AuditRow).where(AuditRow.model == model, AuditRow.change == "version exported")
     last: dict[str, Export] = {}
     for row in session.scalars(query.order_by(AuditRow.seq.desc()).limit(MAX_LINES)):

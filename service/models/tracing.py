@@ -1,4 +1,4 @@
-"""Formats whose library traces the model's function: in another process, as it takes seconds of Python."""
+"""Exports in formats that trace the model's function. A trace takes seconds of Python, so it has its own process."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ NICENESS = 5
 def write_in_process(
     kind: ExportFormat, files: Mapping[str, bytes], parameters: Mapping[str, Any], origin: ModelOrigin
 ) -> dict[str, bytes]:
-    """Return a model in a format. files: the model's own. Blocking: use it in a thread.
+    """Return the files of a model in a format. files: those of the stored model. The call blocks: use a thread.
 
-    Raise ValueError for a model that the format cannot express, MissingExtraError, NotReadyError if the process ends
-    early.
+    Raise ValueError for a model that the format cannot express, MissingExtraError if the format's library is missing,
+    and NotReadyError if the process ends early.
     """
     place = ProcessOptions(SERVING_THREADS, NICENESS, log=logs.current_options())
     context = multiprocessing.get_context("spawn")

@@ -19,11 +19,11 @@ Indices = NDArray[np.int64]
 BLOCK = 64
 """Queries of a block."""
 ADD, SUBTRACT, MULTIPLY, MULTIPLY_ADD, MULTIPLY_SUBTRACT, SUBTRACT_PRODUCT, NEGATE = range(7)
-"""x + y, x − y, x y, x y + z, x y − z, z − x y, −x."""
+"""Codes of x + y, x − y, x y, x y + z, x y − z, z − x y and −x."""
 FIXED = 7
-"""Added to an operation whose y is a constant."""
+"""If y is a constant, this number is added to the code."""
 SUBTRACT_FROM = 2 * FIXED
-"""c − x of a constant c."""
+"""Code of c − x, where c is a constant."""
 
 
 @compiled

@@ -112,7 +112,7 @@ async def export_version(
       Comments state the largest torque error of each joint, and parameters that torque cannot identify.
     - `c`: a tar of `lipserve_model.c` and `lipserve_model.h`, C99 code for control loops that computes torque and its
       standard deviation without dependencies or allocation. The header explains how to use it.
-    - `onnx`: a tar of a model repository, which Triton serves and whose files onnxruntime loads, float64 and float32.
+    - `onnx`: a tar of a Triton model repository with a float64 and a float32 model. onnxruntime loads them, too.
     - `torch`: an archive of `torch.export`. `jax`: a tar of functions of `jax.export`.
 
     The last three compute torque and standard deviation of a batch of states, without LIPServe. All but the archive

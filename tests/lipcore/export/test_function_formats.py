@@ -141,7 +141,7 @@ def test_runtime_alone_passes_the_self_test(
 
 
 def _deflections(state: np.ndarray | None) -> np.ndarray | None:
-    """Return means and half widths of the elements, whose lower bounds come first in the state."""
+    """Return middle and half width of each element's interval. The state has q, all lower bounds, all upper bounds."""
     if state is None:
         return None
     low, high = np.split(state[:, 1:], 2, axis=1)
