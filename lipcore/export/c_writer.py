@@ -44,7 +44,10 @@ WIDE = 8
 VECTORS = SELF_TEST_STATES
 """Queries of the self-test, half of them with PAYLOAD. Every second one has a state after TRAIL."""
 TRAIL = (0.3, -0.5, 0.004, 0.0)
-"""Positions before a query, relative to the query's, in widths of the largest element. Every element deflects partly."""
+"""Positions before a query, relative to the query's, in widths of the largest element.
+
+They deflect every element partly.
+"""
 PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
 """Payload in half of the queries of the self-test."""
 

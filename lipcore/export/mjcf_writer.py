@@ -14,22 +14,20 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.export.sheet import Sheet
-from lipcore.export.simulated_arm import (
+from lipcore.export.description import (
     BASE,
-    HEADER_COMMENTS,
     Element,
-    SimulatedArm,
     add_comments,
+    arm_comments,
     ball_radius,
-    gravity_comments,
-    inertia_at_centre,
     join_values,
-    joint_notes,
+    joint_comments,
+    line_radius,
     reach_of,
-    upright,
     value_text,
 )
+from lipcore.export.sheet import Sheet
+from lipcore.export.simulated_arm import SimulatedArm, inertia_at_centre, upright
 from lipcore.kernels.geometry import rotation_vector_of
 from lipcore.model.plausible import nearest_solid
 
@@ -50,7 +48,7 @@ def mjcf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
     """
     geometry, joints = arm.geometry, arm.joints
     root = Element("mujoco", model=name)
-    add_comments(root, [*HEADER_COMMENTS, *COMMENTS, *gravity_comments(geometry), *arm.notes])
+    add_comments(root, arm_comments(arm, COMMENTS))
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true")
     strength = float(np.linalg.norm(geometry.gravity))
     ElementTree.SubElement(root, "option", gravity=join_values(np.array([0.0, 0.0, -strength])))
@@ -58,7 +56,7 @@ def mjcf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
     ElementTree.SubElement(default, "geom", contype="0", conaffinity="0", density="0", group="1")
     if sheet is not None:
         _custom(root, sheet)
-    line = max(0.02 * float(reach_of(arm)[0]), 1e-3)
+    line = line_radius(reach_of(arm))
     body = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name=BASE)
     body.set("quat", _quaternion(upright(geometry.gravity)))
     for k, joint in enumerate(joints.names):
@@ -67,7 +65,7 @@ def mjcf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
         body = ElementTree.SubElement(body, "body", name=f"{joint}_link", pos=place, quat=turn)
         _inertial(body, arm.bodies[k])
         _joint(body, arm, k)
-        add_comments(body, joint_notes(joints, k) + ([] if sheet is None else [sheet.joint_note(k)]))
+        add_comments(body, joint_comments(arm, k, sheet))
     actuators = ElementTree.SubElement(root, "actuator")
     for joint in joints.names:
         ElementTree.SubElement(actuators, "motor", name=f"{joint}_motor", joint=joint)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
-from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
@@ -13,16 +12,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.files.entries import Chain, Inertia
 from lipcore.kernels.fast.arm import arm_torques
-from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, rotation_of, skew
-
-Element = ElementTree.Element
-
-BASE = "base"
-HEADER_COMMENTS = (
-    "Learnt from torque by LIPServe.",
-    "Torque does not distinguish an arm from its mirror image, nor fix the place of a frame along its axis.",
-    "Limits of position and velocity are the range of the training, not those of the drives.",
-)
+from lipcore.kernels.geometry import Geometry, rotation_of, skew
 
 
 @dataclass(frozen=True)
@@ -144,11 +134,6 @@ def inertia_at_centre(body: Array) -> tuple[Array, Array]:
     return centre, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) + mass * arm @ arm
 
 
-def ball_radius(mass: float) -> float:
-    """Return the radius of an aluminium ball of a mass, m."""
-    return float((0.75 * mass / (np.pi * 2700.0)) ** (1 / 3))
-
-
 def upright(gravity: Array) -> Array:
     """Return the shortest turn of the base after which gravity points down the root's z axis; none without gravity."""
     length = float(np.linalg.norm(gravity))
@@ -160,52 +145,3 @@ def upright(gravity: Array) -> Array:
     if sine == 0.0:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
     return rotation_of(axis / sine * np.arctan2(sine, cosine))
-
-
-def gravity_comments(geometry: Geometry) -> list[str]:
-    """Return comments about gravity and the orientation of the base."""
-    strength = float(np.linalg.norm(geometry.gravity))
-    if strength == 0.0:
-        return ["Torque was measured without gravity: the orientation of the base is unknown."]
-    if abs(strength - STANDARD_GRAVITY) > 1e-9:
-        return [f"Gravity is {strength!r} m/s² here: set it in the simulator."]
-    return []
-
-
-def reach_of(arm: SimulatedArm) -> Array:
-    """Return a bound on the distance from each joint to the centres of mass of the bodies that it moves, (n,) m."""
-    steps = np.linalg.norm(arm.geometry.translation, axis=1)
-    slides = [kind == "prismatic" for kind in arm.geometry.joint_types]
-    steps = steps + np.maximum(np.abs(arm.joints.lower), np.abs(arm.joints.upper)) * slides
-    out, beyond = np.zeros(len(steps)), 0.0
-    for k in range(len(steps) - 1, -1, -1):
-        beyond = max(float(np.linalg.norm(arm.bodies[k, 1:4])) / arm.bodies[k, 0], beyond)
-        out[k] = beyond
-        beyond += steps[k]
-    return out
-
-
-def joint_notes(joints: ArmJoints, k: int) -> list[str]:
-    """Return the comments of a joint: what is left out, and parameters that torque does not determine."""
-    terms = {"damping": joints.viscous[k], "friction": joints.coulomb[k], "rotor": joints.rotor[k]}
-    notes = [f"learnt {key} is {value_text(value)}, written as 0" for key, value in terms.items() if value < 0]
-    notes.append(f"offset torque {value_text(joints.offset[k])} is left out")
-    if joints.undetermined and joints.undetermined[k]:
-        notes.append(f"not identifiable from torque: {', '.join(joints.undetermined[k])}")
-    return notes
-
-
-def add_comments(element: Element, texts: Sequence[str]) -> None:
-    """Append comments to an element."""
-    for text in texts:
-        element.append(ElementTree.Comment(f" {text.replace('--', '- -')} "))
-
-
-def join_values(values: Array) -> str:
-    """Return numbers that read back exactly."""
-    return " ".join(value_text(value) for value in values)
-
-
-def value_text(value: float) -> str:
-    """Return a number that reads back exactly."""
-    return repr(float(value) + 0.0)

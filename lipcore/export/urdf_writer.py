@@ -14,23 +14,20 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.export.sheet import Sheet
-from lipcore.export.simulated_arm import (
+from lipcore.export.description import (
     BASE,
-    HEADER_COMMENTS,
-    ArmJoints,
     Element,
-    SimulatedArm,
     add_comments,
+    arm_comments,
     ball_radius,
-    gravity_comments,
-    inertia_at_centre,
     join_values,
-    joint_notes,
+    joint_comments,
+    line_radius,
     reach_of,
-    upright,
     value_text,
 )
+from lipcore.export.sheet import Sheet
+from lipcore.export.simulated_arm import ArmJoints, SimulatedArm, inertia_at_centre, upright
 from lipcore.kernels.geometry import STANDARD_GRAVITY, rotation_to_axis
 
 ROOT = "world"
@@ -49,9 +46,9 @@ def urdf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
     geometry, bodies, joints = arm.geometry, arm.bodies, arm.joints
     n = geometry.n_joints
     robot = Element("robot", {"name": name, "xmlns:drake": "http://drake.mit.edu"})
-    add_comments(robot, [*HEADER_COMMENTS, *COMMENTS, *gravity_comments(geometry), *arm.notes])
+    add_comments(robot, arm_comments(arm, COMMENTS))
     parent, reach = BASE, reach_of(arm)
-    line = max(0.02 * float(reach[0]), 1e-3)
+    line = line_radius(reach)
     turn = upright(geometry.gravity)
     if not np.array_equal(turn, np.eye(3)):
         ElementTree.SubElement(robot, "link", name=ROOT)
@@ -65,7 +62,7 @@ def urdf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
             robot, joint, geometry.joint_types[k], parent, child, geometry.rotation[k], geometry.translation[k]
         )
         _moving(made, geometry.axis[k], joints, k, float(effort[k]))
-        add_comments(made, joint_notes(joints, k) + ([] if sheet is None else [sheet.joint_note(k)]))
+        add_comments(made, joint_comments(arm, k, sheet))
         _link(robot, child, bodies[k], geometry.translation[k + 1] if k + 1 < n else None, line)
         parent = child
     for joint, rotor in zip(joints.names, joints.rotor, strict=True):
