@@ -47,7 +47,7 @@ from service.learning import friction, refresh
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.metrics import LearningCollector
-from service.models import deletion, registry
+from service.models import deletion, shipped
 from service.models.loaded import LoadedModels
 from service.replication import Replication
 from service.runtime.confinement import protections
@@ -192,7 +192,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     database, files = storage.database, storage.files
     database.adapter.settle()
     start_sweeping(database, files)
-    registry.install_shipped(database, files)
+    shipped.install_shipped(database, files)
     loaded = LoadedModels(storage, LearntVersions(database, files))
     logger.info("loaded %s of %s", counted(loaded.preload(), "model"), settings.home)
 

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from sqlalchemy import bindparam, func, select, tuple_, update
 from sqlalchemy.orm import Session
 
-import lipcore
 from lipcore.estimators.base import RobotKind
-from lipcore.files.persistence import checksums, read_manifest
+from lipcore.files.persistence import checksums
 from lipcore.model.verdict import OPTIONS, VerdictOptions
 from lipcore.vocabulary import offered_components
 from service.contract.models import Model, ModelPage, Promotion, Version, VersionSummary
 from service.contract.verdict import Thresholds
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
-from service.foundation.settings import shipped_models
 from service.models import verdicts
 from service.storage import audit
 from service.storage.database import (
@@ -34,12 +31,11 @@ from service.storage.database import (
     fetch,
     now,
 )
-from service.storage.files import Files, new_id
+from service.storage.files import Files
 from service.storage.rows import Page, read_page
 
 logger = logging.getLogger(__name__)
 
-SHIPPED = "panda-sim"
 SERVING = "serving"
 """The alias of every model for its serving version."""
 CANDIDATE = "candidate"
@@ -223,44 +219,6 @@ def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:
     query = select(ServingRow.model, ServingRow.version, ServingRow.change).where(ServingRow.model.in_(models))
     with database.session() as session:
         return {model: Serving(version, change) for model, version, change in session.execute(query)}
-
-
-def install_shipped(database: Database, files: Files) -> None:
-    """Register the model that comes with LIPServe; after an upgrade that brings another one, as a new version.
-
-    Do nothing if the user has trained or imported a version under that name, or has deleted the model or its newest
-    version.
-    """
-    source = shipped_models() / SHIPPED
-    with database.session() as session:
-        if not _is_missing(session, source):
-            return
-    folder, version = new_id("mv"), None
-    with files.new_version(folder) as target:
-        manifest = lipcore.copy_model(source, target)
-    with database.transaction() as session:
-        if _is_missing(session, source):  # another service that starts at the same time may have registered it
-            version = publish(session, SHIPPED, folder, manifest, None)
-    if version is None:
-        files.delete_version(folder)
-        return
-    logger.info("registered the shipped model %s as version %d", SHIPPED, version)
-
-
-def _is_missing(session: Session, source: Path) -> bool:
-    """Return whether the shipped model must be registered."""
-    query = select(VersionRow).where(VersionRow.model == SHIPPED).order_by(VersionRow.version.desc())
-    known = list(session.scalars(query))
-    row = session.scalar(select(ModelRow).where(ModelRow.name == SHIPPED))
-    if row is None:
-        return session.get(DeletedModelRow, SHIPPED) is None
-    if not known:
-        return True
-    made_by_user = known[0].job is not None or "imported" in known[0].manifest["lineage"]
-    if made_by_user or row.last_version > known[0].version:
-        return False
-    shipped = read_manifest(source)["tensors"]["sha256"]
-    return all(each.manifest["tensors"]["sha256"] != shipped for each in known)
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:

@@ -12,7 +12,7 @@ from sqlalchemy import select
 
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.models import registry
+from service.models import shipped
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
 from service.storage.storage import HomeInUseError, lock_home
@@ -98,7 +98,7 @@ def test_interrupted_jobs_are_done_again_up_to_three_times_or_cancelled(second_s
 def make_earlier_home(home, job):
     """Make a home whose newest version of the shipped model has an obsolete format."""
     database, files = Database.of(Settings(home=home)), Files(home)
-    registry.install_shipped(database, files)
+    shipped.install_shipped(database, files)
     with database.transaction() as session:
         row = session.scalar(select(VersionRow))
         row.job, row.manifest = job, {**row.manifest, "format_version": 2, "tensors": {"sha256": "of another"}}

@@ -14,7 +14,7 @@ from service.foundation.settings import Settings
 from service.journal import snapshots
 from service.learning.ingest.append import Arrival
 from service.learning.learner.learnt import LearntVersions
-from service.models import registry
+from service.models import registry, shipped
 from service.models.loaded import LoadedModels
 from service.storage import database as tables
 from service.storage.database import Database, now
@@ -204,7 +204,7 @@ def test_shipped_model_stays_deleted(home):
     database, files = Database.of(Settings(home=home)), Files(home)
 
     def installed_versions():
-        registry.install_shipped(database, files)
+        shipped.install_shipped(database, files)
         with database.session() as session:
             return session.scalars(select(tables.VersionRow.version)).all()
 
@@ -212,6 +212,6 @@ def test_shipped_model_stays_deleted(home):
     with database.transaction() as session:
         for table in (tables.AliasMoveRow, tables.ServingRow, tables.LearnerRow, tables.VersionRow, tables.ModelRow):
             session.query(table).delete()
-        session.add(tables.DeletedModelRow(name=registry.SHIPPED, last_version=1, deleted_at=now()))
+        session.add(tables.DeletedModelRow(name=shipped.SHIPPED, last_version=1, deleted_at=now()))
     assert installed_versions() == []
     database.close()

@@ -13,7 +13,7 @@ from lipcore.files.manifest import MANIFEST, read_manifest_bytes
 from lipcore.robots.library import load_robot
 from lipcore.robots.urdf import RigidBody
 from service.foundation.settings import Settings, shipped_models
-from service.models import registry
+from service.models import registry, shipped
 from service.storage.database import Database
 from service.storage.files import Files, new_id
 from tests.lipcore.arms import parameters_of
@@ -74,7 +74,7 @@ def publish_arm(database: Database, files: Files, model: str, **changed: Any) ->
 
     changed: other entries of its `parameters`; None removes one.
     """
-    source, folder = persistence.read_files(shipped_models() / registry.SHIPPED), new_id("mv")
+    source, folder = persistence.read_files(shipped_models() / shipped.SHIPPED), new_id("mv")
     manifest = json.loads(source[MANIFEST])
     report = parameters_of(panda()) | changed
     manifest["parameters"] = {name: value for name, value in report.items() if value is not None}

@@ -12,7 +12,7 @@ from sqlalchemy import select
 
 from service.app import create_app
 from service.cli.verify import verify_home
-from service.models import registry
+from service.models import registry, shipped
 from service.models.archive import MEDIA_TYPE
 from service.storage.database import Database, VersionRow
 from service.storage.files import Files, FilesUnreachableError
@@ -96,7 +96,7 @@ def test_services_starting_together_install_one_shipped_model(shared):
 
     def start(database, files):
         barrier.wait()
-        registry.install_shipped(database, files)
+        shipped.install_shipped(database, files)
 
     threads = [threading.Thread(target=start, args=each) for each in opened]
     for thread in threads:

@@ -144,7 +144,7 @@ STARTS = {
     "interrupted jobs requeued": Fault(COMMIT, "after", RECOVER, "itself"),
 }
 """Points during a start after a kill."""
-INSTALL = "service.models.registry:install_shipped"
+INSTALL = "service.models.shipped:install_shipped"
 FIRST_STARTS = {
     "before the tables are committed": Fault("service.storage.database.migrations:_upgrade", "after", victim="itself"),
     "half of the shipped model written": Fault(FSYNC, "before", INSTALL, "itself", skip=1),
