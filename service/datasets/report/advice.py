@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.contract.datasets import Excitation, JointExcitation, JointLimits, JointNoise, JointSaturation, Lag, Timing
-from service.datasets.report import texts
+from service.datasets.report import advice_texts, texts
 from service.datasets.report.excitation import FRICTION
 from service.datasets.report.lag import LAG, is_nonzero
 
@@ -85,11 +85,11 @@ def _narrow_motion(timing: Timing, excitation: Excitation) -> list[str]:
     out = []
     moved = [each.joint for each in excitation.joints if each.span >= ADVICE.still_span]
     if _has_poses_only(excitation):
-        out.append(texts.held_poses(excitation.standstill or 0.0))
+        out.append(advice_texts.held_poses(excitation.standstill or 0.0))
     elif len(moved) == 1 < len(excitation.joints):
-        out.append(texts.one_moving_joint(moved[0]))
+        out.append(advice_texts.one_moving_joint(moved[0]))
     if timing.duration_s is not None and timing.duration_s < ADVICE.too_short_s:
-        out.append(texts.too_short(timing.duration_s))
+        out.append(advice_texts.too_short(timing.duration_s))
     return out
 
 
@@ -135,40 +135,45 @@ def collect_advice(
     both_ways = [each for each in moved if each.joint not in one_way]
     slow = {each.joint for each in limits if each.speed_used is not None and each.speed_used < ADVICE.min_used}
     needs = [
-        (still, texts.still_joint(ADVICE.still_span)),
-        (one_way, texts.ONE_DIRECTION),
+        (still, advice_texts.still_joint(ADVICE.still_span)),
+        (one_way, advice_texts.ONE_DIRECTION),
         (
             [each.joint for each in both_ways if min(each.slow_forwards, each.slow_backwards) < FRICTION.seldom],
-            texts.little_slow_motion(FRICTION.slow),
+            advice_texts.little_slow_motion(FRICTION.slow),
         ),
         (
             [each.joint for each in both_ways if "not determined" in (each.viscous.verdict, each.coulomb.verdict)],
-            texts.UNDETERMINED_FRICTION,
+            advice_texts.UNDETERMINED_FRICTION,
         ),
-        ([each.joint for each in both_ways if each.offset.verdict == "not determined"], texts.UNDETERMINED_OFFSET),
-        ([each.joint for each in moved if _has_moved_little(each)], texts.SMALL_RANGE),
-        ([each.joint for each in moved if each.joint in slow], texts.slow_joint(ADVICE.min_used)),
-        ([each.joint for each in moved if each.collinear > ADVICE.collinear], texts.REGULAR_MOTION),
+        (
+            [each.joint for each in both_ways if each.offset.verdict == "not determined"],
+            advice_texts.UNDETERMINED_OFFSET,
+        ),
+        ([each.joint for each in moved if _has_moved_little(each)], advice_texts.SMALL_RANGE),
+        ([each.joint for each in moved if each.joint in slow], advice_texts.slow_joint(ADVICE.min_used)),
+        ([each.joint for each in moved if each.collinear > ADVICE.collinear], advice_texts.REGULAR_MOTION),
     ]
     if poses:
-        needs = [(names, need) for names, need in needs if need == texts.SMALL_RANGE]
-    out = [texts.advice_for(names, need) for names, need in needs if names]
+        needs = [(names, need) for names, need in needs if need == advice_texts.SMALL_RANGE]
+    out = [advice_texts.advice_for(names, need) for names, need in needs if names]
     bodies = None if poses else excitation.whole
     if bodies is not None and bodies.rank < bodies.parameters:
-        out.append(texts.weak_excitation(bodies.parameters - bodies.rank, bodies.parameters, bodies.weakest_body))
+        out.append(
+            advice_texts.weak_excitation(bodies.parameters - bodies.rank, bodies.parameters, bodies.weakest_body)
+        )
     if noisy := [each.joint for each in noise if (each.torque_share or 0.0) > ADVICE.max_noise]:
-        out.append(texts.advice_for(noisy, texts.noisy_torque(ADVICE.max_noise)))
+        out.append(advice_texts.advice_for(noisy, advice_texts.noisy_torque(ADVICE.max_noise)))
     if smooth := [each.joint for each in noise if each.smoothed]:
-        out.append(texts.advice_for(smooth, texts.SMOOTHED_TORQUE))
+        out.append(advice_texts.advice_for(smooth, advice_texts.SMOOTHED_TORQUE))
     if not poses and (excitation.standstill or 0.0) > ADVICE.standstill:
-        out.append(texts.much_standstill(excitation.standstill or 0.0))
+        out.append(advice_texts.much_standstill(excitation.standstill or 0.0))
     dimensions, n = excitation.motion_dimensions, len(joints)
     if dimensions is not None and 0 < dimensions < ADVICE.min_independence * n and n - len(still) > 1:
-        out.append(texts.dependent_motion(dimensions, n))
+        out.append(advice_texts.dependent_motion(dimensions, n))
     if excitation.period_s is not None:
-        out.append(texts.repeated_motion(excitation.period_s))
+        out.append(advice_texts.repeated_motion(excitation.period_s))
     if timing.duration_s is not None and ADVICE.too_short_s <= timing.duration_s < ADVICE.short_s:
-        out.append(texts.short_recording(timing.duration_s))
+        out.append(advice_texts.short_recording(timing.duration_s))
     return out
 
 

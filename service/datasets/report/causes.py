@@ -14,7 +14,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.data.signals import noise_level
 from service.contract.datasets import JointExcitation, Remedy
-from service.datasets.report import texts
+from service.datasets.report import fault_texts
 from service.datasets.report.bodies import (
     BODIES,
     BlockFit,
@@ -132,7 +132,7 @@ def _check_work(upload: Upload, signals: Signals, work: TorqueWork) -> Remedy | 
     return make_remedy(
         "torque_sign",
         upload.names,
-        texts.energy_loss(-work.power),
+        fault_texts.energy_loss(-work.power),
         upload.scaled_torque([-1.0] * upload.n_joints),
         only_if="all signs are inverted",
     )
@@ -145,7 +145,7 @@ def _check_friction(upload: Upload, signs: Sequence[int]) -> Remedy | None:
     return make_remedy(
         "friction_sign",
         negative,
-        texts.negative_friction(negative),
+        fault_texts.negative_friction(negative),
         upload.scaled_torque([-1.0 if sign < 0 else 1.0 for sign in signs]),
         only_if="the sign is inverted",
     )
@@ -173,7 +173,7 @@ class _Case:
             return make_remedy(
                 "torque_order",
                 [joint for joint, _ in moved],
-                texts.torque_order(robot, moved),
+                fault_texts.torque_order(robot, moved),
                 self.upload.torque_columns(torques.column),
             )
         if joints is None:
@@ -185,7 +185,7 @@ class _Case:
         return make_remedy(
             "joint_order",
             [name for name, _ in moved],
-            texts.joint_order(robot, moved),
+            fault_texts.joint_order(robot, moved),
             self.upload.joint_names(actual),
         )
 
@@ -209,7 +209,7 @@ class _Case:
         return make_remedy(
             "torque_sign",
             inverted,
-            texts.opposite_sign(inverted, self.bodies.name),
+            fault_texts.opposite_sign(inverted, self.bodies.name),
             self.upload.scaled_torque(np.where(opposite, -1.0, 1.0).tolist()),
         )
 
@@ -222,7 +222,9 @@ class _Case:
             if not clear or not MATCH.one[0] < float(np.median(g[heavy])) < MATCH.one[1]:
                 return None
             names, options = self._names(heavy), {"torque_convention": "gravity_included"}
-            return make_remedy("gravity_included", names, texts.unexpected_gravity(names, g[heavy], robot), options)
+            return make_remedy(
+                "gravity_included", names, fault_texts.unexpected_gravity(names, g[heavy], robot), options
+            )
         known = (comparison.visible[:, 0] > CAUSE.visible) & (comparison.gravity_std < CAUSE.zero)
         expected = np.flatnonzero(known).tolist()
         absent = [j for j in expected if self._lacks_gravity(j)]
@@ -233,17 +235,17 @@ class _Case:
         upwards = bool(heavy) and bool((g[heavy] < 0).all())
         if (comparison.explained < CAUSE.explained).any() and (tilt := self._find_tilt()) is not None:
             names = self._names(tilt[0])
-            return make_remedy("mounting", names, texts.tilted_gravity(names, robot, tilt[1]))
+            return make_remedy("mounting", names, fault_texts.tilted_gravity(names, robot, tilt[1]))
         names = self._names(heavy)
         if upwards:
-            return make_remedy("mounting", names, texts.upward_gravity(names, g[heavy], robot))
+            return make_remedy("mounting", names, fault_texts.upward_gravity(names, g[heavy], robot))
         if missing:
             names, options = self._names(absent), {"torque_convention": "gravity_compensated"}
-            return make_remedy("no_gravity", names, texts.missing_gravity(names, g[absent], robot), options)
+            return make_remedy("no_gravity", names, fault_texts.missing_gravity(names, g[absent], robot), options)
         if heavy and all(CAUSE.double[0] < g[j] < CAUSE.double[1] for j in heavy):
             if inertia is not None and not MATCH.one[0] < inertia < MATCH.one[1]:
                 return None
-            return make_remedy("gravity_doubled", names, texts.doubled_gravity(names, g[heavy], robot, inertia))
+            return make_remedy("gravity_doubled", names, fault_texts.doubled_gravity(names, g[heavy], robot, inertia))
         return None
 
     def check_scale(self) -> Remedy | None:
@@ -267,7 +269,7 @@ class _Case:
         return make_remedy(
             "torque_factor",
             names,
-            texts.torque_scale(names, g, self.bodies.name),
+            fault_texts.torque_scale(names, g, self.bodies.name),
             self.upload.torque_constants([1 / factor for factor in factors]) if known else None,
             only_if="these are unknown",
         )

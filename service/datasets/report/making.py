@@ -17,7 +17,7 @@ from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.contract import datasets as schema
 from service.datasets.mapping.joints import WARNING
-from service.datasets.report import texts
+from service.datasets.report import advice_texts, texts
 from service.datasets.report.advice import collect_advice, collect_warnings, describe_excitation
 from service.datasets.report.bodies import Bodies, Comparison, Signals, compare
 from service.datasets.report.causes import TorqueWork, find_faults
@@ -90,7 +90,7 @@ def make_report(
     suggested = [] if proposal is None else [proposal]
     unknown = ask_for_robot(len(names)) if profile is None and proposal is None else None
     if gravity and against is not None and not _is_gravity_determined(against):
-        reading.append(texts.undetermined_gravity(against.robot))
+        reading.append(advice_texts.undetermined_gravity(against.robot))
     robot_advice = [each.text for each in suggested] + ([] if unknown is None else [unknown])
     report = schema.DatasetReport(
         rows_uploaded=raw.rows,

@@ -12,7 +12,7 @@ import numpy as np
 from lipcore.profiles import profile
 from service.contract.datasets import Cause, Remedy
 from service.datasets.mapping.choice import format_numbers as numbers
-from service.datasets.report.texts import with_options
+from service.datasets.report.fault_texts import with_options
 
 
 @dataclass(frozen=True)
