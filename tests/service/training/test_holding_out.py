@@ -5,7 +5,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 import lipcore
 from lipcore.data.metrics import evaluate
@@ -14,22 +13,17 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from service.models import registry
-from service.models.archive_lineage import Lineage
-from service.models.lineage import describe_datasets, learnt_from
 from service.storage.database import DatasetRow
 from service.training import planned_fit
-from service.training.holding_out import CannotHoldOutError, find_earlier_split
+from service.training.holding_out import find_earlier_split
 from service.training.material import load_datasets
 from tests.service.data import QUICK, arrays, columns, csv, ended, npz, post, queue, service_of, stream, train, upload
 from tests.service.models.archives.packing import exported, imported
 from tests.service.training.conftest import assert_invalid, refresh, version_of
+from tests.service.training.held_out import ENTRY, ROWS
 
-ROWS = 120
 TRAIN, HELD_OUT = slice(0, 82), slice(86, ROWS)
 """At 10 Hz the last 36 of 120 rows are held out; 0.25 s before and after the boundary is two rows on each side."""
-ENTRY = {"id": "ds_1", "sha256": "s", "whole": False, "guard": 0.25, "guard_unit": "s", "rows": 34, "guarded": 4}
-HOLDOUT = {"split": {"share": 0.3}, "datasets": [ENTRY], "rows": 34, "guarded": 4, "nmse": [0.1]}
-EPISODE, TIMES = np.zeros(ROWS, dtype=np.int64), np.arange(ROWS) / 10
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
 REPETITION = ("repeats_training", "period_s", "warnings")
 
@@ -359,52 +353,3 @@ def test_automatic_split_holds_out_a_part_without_repetition(api):
     assert np.flatnonzero(split.held_out(samples.episode, samples.t)).tolist() == list(range(last - 5))
     _, _, record = load_split(api, dataset, share=0.3, kind="last")
     assert record["datasets"][0]["stretches"] is None
-
-
-def test_lineage_names_the_data_preparation():
-    prepared = {"recipe": {"cutoff_hz": 4.0}, "steps": [{"step": "trim", "text": "5 rows cut off"}]}
-    record = {"id": "ds_1", "name": "n", "sha256": "s", "rows": 5}
-    for known in (prepared, {}):
-        assert describe_datasets([DatasetRow(**record, report={"rows": 5, **known})]) == [{**record, **known}]
-
-
-def test_data_sets_without_learnt_rows_are_not_in_training():
-    lineage = {"datasets": [{"id": "ds_1", "sha256": "s"}, {"id": "ds_2", "sha256": "r"}], "holdout": HOLDOUT}
-    entire = {**HOLDOUT, "datasets": [{**ENTRY, "whole": True}]}
-    assert learnt_from(lineage) == {"ds_1", "s", "ds_2", "r"}
-    assert learnt_from({**lineage, "holdout": entire}) == {"ds_2", "r"}
-    assert learnt_from({**lineage, "holdout": {**entire, "learnt": True}}) == {"ds_1", "s", "ds_2", "r"}
-    assert learnt_from({}) == frozenset()
-
-
-@pytest.mark.parametrize("row", [DatasetRow(id="ds_1", sha256="?"), DatasetRow(id="ds_9", sha256="s")])
-def test_data_set_is_recognised_by_id_or_samples(row):
-    assert find_earlier_split(DatasetRow(id="ds_9", sha256="?"), {"holdout": HOLDOUT}) is None
-    assert find_earlier_split(row, {}) is None
-    split = find_earlier_split(row, {"holdout": HOLDOUT})
-    assert np.flatnonzero(split.held_out(EPISODE, TIMES)).tolist() == list(range(86, 120))
-
-
-@pytest.mark.parametrize("counts", [{"rows": 35}, {"guarded": 3}, {"stretches": [[0, 30]]}])
-def test_inconsistent_split_in_a_lineage_is_rejected(counts):
-    """If the counts do not match, the samples may not be the held-out ones."""
-    reply = {**HOLDOUT, "datasets": [{**ENTRY, **counts}]}
-    with pytest.raises(CannotHoldOutError, match="cannot be split as before"):
-        find_earlier_split(DatasetRow(id="ds_1", sha256="s"), {"holdout": reply}).held_out(EPISODE, TIMES)
-
-
-@pytest.mark.parametrize(
-    "holdout",
-    [
-        {**HOLDOUT, "split": {"kind": "rows"}},
-        *(
-            {**HOLDOUT, "datasets": [{**ENTRY, **wrong}]}
-            for wrong in ({"guard": -1.0}, {"rows": "3"}, {"stretches": [[0, 3, 4]]}, {"stretches": [[-1, 3]]})
-        ),
-        3,
-    ],
-)
-def test_holdout_of_an_imported_lineage_is_checked(holdout):
-    Lineage.model_validate({"holdout": HOLDOUT})
-    with pytest.raises(ValidationError):
-        Lineage.model_validate({"holdout": holdout})
