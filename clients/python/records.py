@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
 from service.api.oip import schema as oip
-from service.contract import audit, datasets, health, learning, models, overview, robots, verdict
+from service.contract import audit, datasets, health, learning, live, models, overview, robots, verdict
 from service.contract import jobs as training
 from service.contract import observations as observing
 from service.contract import payload as payloads
@@ -55,7 +55,7 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
         (learning.RolledBack, learning.Quality, learning.Learning, learning.Decided, learning.Alarm),
     ),
     "payloads": ("Payloads.", (payloads.Payloads,)),
-    "live": ("Events of the live view of a model.", (learning.LiveStatus, learning.LiveLost)),
+    "live": ("Events of the live view of a model.", (live.LiveStatus, live.LiveLost)),
     "overview": ("Summaries of models.", (overview.ModelOverview,)),
     "audit": ("Audit log.", (audit.AuditEntry,)),
     "server": (

@@ -24,7 +24,7 @@ from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.learner import uncovered
 from lipcore.vocabulary import CODES, Code
-from service.contract.learning import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
+from service.contract.live import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
 from service.learning.ingest.append import LoggedBatch
 from service.models.loaded import ServedModel

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lipcore.vocabulary import CODES
-from service.contract.learning import LiveAnswers, LiveNovelty, LiveStatus
+from service.contract.live import LiveAnswers, LiveNovelty, LiveStatus
 from service.journal import log
 from service.learning import owner
 from service.learning.control import decisions, payload, status

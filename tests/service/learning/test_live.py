@@ -9,7 +9,7 @@ import pytest
 from lipcore.online.batch import Rows
 from lipcore.online.screening import PredictedBatch
 from lipcore.vocabulary import Code
-from service.contract.learning import LiveRows, LiveStatus
+from service.contract.live import LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
 from service.learning.ingest.append import LoggedBatch
 from service.learning.live import feed
