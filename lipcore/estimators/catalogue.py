@@ -16,8 +16,9 @@ from lipcore.data.motion import Array, Motion, check_joint_types
 from lipcore.estimators.options import FitOptions
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
-from lipcore.kernels.base import SumKernel, TorqueKernel
+from lipcore.kernels.base import TorqueKernel
 from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel

@@ -13,7 +13,8 @@ import numpy as np
 
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import Estimator
-from lipcore.kernels.base import SumKernel, TorqueKernel
+from lipcore.kernels.base import TorqueKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import deflections_of
 from lipcore.model.functionals import (

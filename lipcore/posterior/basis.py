@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
-from lipcore.kernels.base import Cross, LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
+from lipcore.kernels.base import Cross, LinearKernel, PairKernel, Params, TorqueKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.residual import ResidualKernel
 from lipcore.posterior.linalg import block_diagonal, cholesky, solve_lower
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
-from lipcore.kernels.base import Params, SumKernel, TorqueKernel
+from lipcore.kernels.base import Params, TorqueKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.posterior.basis import Basis, split
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.exact import ExactPosterior, Prediction

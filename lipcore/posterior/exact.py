@@ -10,7 +10,8 @@ from math import log, pi
 import numpy as np
 
 from lipcore.data.motion import Array, Motion
-from lipcore.kernels.base import LinearKernel, Params, SumKernel, TorqueKernel
+from lipcore.kernels.base import LinearKernel, Params, TorqueKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.posterior.linalg import Factor, add_diagonal, cholesky
 from lipcore.vocabulary import Device
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.arrays import constant, on_diagonal, reordered
-from lipcore.kernels.base import LinearKernel, Params, PartialKernel, Regressor, State
+from lipcore.kernels.base import LinearKernel, Params, Regressor, State
+from lipcore.kernels.combined import PartialKernel
 from lipcore.kernels.drive.play import deflections_of
 from lipcore.kernels.drive.terms import (
     SHAPE_SPEEDS,

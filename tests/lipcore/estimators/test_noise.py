@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators import noise
-from lipcore.kernels.base import SumKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.posterior.exact import negative_log_evidence, noisy_gram
 from tests.lipcore.data.test_metrics import recording

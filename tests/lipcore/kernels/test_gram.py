@@ -7,7 +7,7 @@ import pytest
 
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import make_estimator
-from lipcore.kernels.base import SumKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.drive.terms import SIGN_WIDTH, STRIBECK_SPEED
 from lipcore.kernels.lip import LipKernel

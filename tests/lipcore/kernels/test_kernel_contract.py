@@ -15,8 +15,9 @@ from torch import Tensor
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
-from lipcore.kernels.base import LinearKernel, PairKernel, State, SumKernel, TorqueKernel
+from lipcore.kernels.base import LinearKernel, PairKernel, State, TorqueKernel
 from lipcore.kernels.chain import ChainKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import ELEMENTS, deflections_of, element_widths
 from lipcore.kernels.drive.terms import drive_features, drive_terms

@@ -11,7 +11,8 @@ import pytest
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
+from lipcore.kernels.base import LinearKernel, PairKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.kernels.fast.answer import root_of_part
 from lipcore.posterior.evaluator import QUERIES, Evaluator

@@ -11,7 +11,8 @@ from scipy.stats import multivariate_normal
 from lipcore import FitOptions, NotPositiveDefiniteError, Samples, TorqueModel, load
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import ESTIMATORS, make_estimator
-from lipcore.kernels.base import Params, SumKernel, TorqueKernel
+from lipcore.kernels.base import Params, TorqueKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.model import dynamics
 from lipcore.model.parameters import weight_posterior

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from lipcore import FitCancelledError, FitOptions, Samples, TorqueModel, train
 from lipcore.data.motion import Array, Motion
-from lipcore.kernels.base import SumKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import Drive, DriveKernel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.linalg import NotPositiveDefiniteError, eigen
