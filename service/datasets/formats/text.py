@@ -29,10 +29,13 @@ from service.foundation.errors import InvalidDataError, invalid_data, invalid_re
 SAMPLE_BYTES = 512 * 1024
 """Bytes at the start of a file that show its layout."""
 DIALECT_CHARS = 16 * 1024
-"""Max characters that CleverCSV reads. The time that it takes grows with the square of the longest word."""
+"""Max characters that CleverCSV reads."""
+MAX_WORD_CHARS = 200
+"""Max characters of a word that CleverCSV reads: its time grows with their square."""
 MAX_LINE_BYTES = 1024 * 1024
 """Max length of a line; also the size of the blocks that are parsed."""
 DELIMITERS = (",", ";", "\t", "|", " ")
+_LONG_WORD = re.compile(rf"([^,;\t| \"'\r\n]{{{MAX_WORD_CHARS}}})[^,;\t| \"'\r\n]+")
 BLANK = " "
 """The delimiter that stands for any run of blanks and tabs."""
 
@@ -95,7 +98,8 @@ def _find_dialect(lines: Sequence[str]) -> tuple[str, str]:
         chars += len(line)
         some.append(line)
     sample = "".join(some)[:DIALECT_CHARS]  # the first line may be longer
-    found = clevercsv.Detector().detect(sample.replace("\0", ""), delimiters=DELIMITERS)
+    text = _LONG_WORD.sub(r"\1", sample.replace("\0", ""))
+    found = clevercsv.Detector().detect(text, delimiters=DELIMITERS)
     if found is None:
         return ",", '"'
     delimiter, quote = found.delimiter or ",", found.quotechar or '"'
