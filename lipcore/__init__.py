@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from lipcore.estimators.options import FitOptions
     from lipcore.files.manifest import ModelFormatError
     from lipcore.files.persistence import copy_model, load, save
-    from lipcore.model.torque_model import TorqueModel, TorquePrediction
+    from lipcore.model.prediction import TorquePrediction
+    from lipcore.model.torque_model import TorqueModel
     from lipcore.posterior.linalg import NotPositiveDefiniteError
     from lipcore.training.train import train
 
@@ -59,7 +60,7 @@ _PLACES = {
     "NotPositiveDefiniteError": "posterior.linalg",
     "Samples": "data.samples",
     "TorqueModel": "model.torque_model",
-    "TorquePrediction": "model.torque_model",
+    "TorquePrediction": "model.prediction",
     "copy_model": "files.persistence",
     "load": "files.persistence",
     "save": "files.persistence",

@@ -17,6 +17,12 @@ from lipcore.kernels.base import TorqueKernel
 from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import deflections_of
+from lipcore.model.equation import (
+    UnavailableComponentError,
+    dynamics_terms,
+    gains,
+    with_fixed_deflections,
+)
 from lipcore.model.functionals import (
     Combination,
     EnergyKernel,
@@ -39,10 +45,6 @@ _TORQUES: dict[ComponentName, dict[str, float]] = {
 """Components as sums of torques at standstill, moving without acceleration, and accelerating from standstill."""
 LOAD_STEPS = 4
 """Steps of forward dynamics. Each reduces the remaining torque to a few percent: the share that the load determines."""
-
-
-class UnavailableComponentError(ValueError):
-    """The component does not exist, or the model's estimator does not have it."""
 
 
 class IndefiniteInertiaError(ValueError):
@@ -75,13 +77,13 @@ def components(
     a wrong number of joints, or if `tau` is missing, of another shape or not needed. Raise IndefiniteInertiaError.
     """
     asked = _check(model, motion, names, tau)
-    posterior, terms = model.posterior, _dynamics_terms(model.estimator)
+    posterior, terms = model.posterior, dynamics_terms(model.estimator)
     drive = model.estimator.terms.get("friction")
     estimates: dict[str, Estimate] = {}
     torques = [name for name in asked if name in _TORQUES or name == "inertia_matrix"]
     if torques:
-        fixed = _with_fixed_deflections(model.estimator, motion)
-        estimates |= _torque_parts(posterior, SumKernel(*terms, *_gains(drive)), fixed, torques)
+        fixed = with_fixed_deflections(model.estimator, motion)
+        estimates |= _torque_parts(posterior, SumKernel(*terms, *gains(model.estimator)), fixed, torques)
     if "friction" in asked:
         assert drive is not None  # `_check` has checked it
         friction = drive.friction() if isinstance(drive, DriveKernel) else drive
@@ -113,8 +115,8 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
     Raise IndefiniteInertiaError if M is not positive definite.
     """
     posterior = model.posterior
-    friction, fixed = model.estimator.terms.get("friction"), _with_fixed_deflections(model.estimator, motion)
-    inertia = inertia_matrix(posterior, SumKernel(*_dynamics_terms(model.estimator)), fixed)
+    friction, fixed = model.estimator.terms.get("friction"), with_fixed_deflections(model.estimator, motion)
+    inertia = inertia_matrix(posterior, SumKernel(*dynamics_terms(model.estimator)), fixed)
     inertia = 0.5 * (inertia + inertia.mT)
     lowest = np.linalg.eigvalsh(inertia)[:, 0]
     if not (lowest > 0).all():
@@ -179,9 +181,9 @@ def _without_gravity(model: TorqueModel, motion: Motion) -> Estimate:
     if isinstance(drive, DriveKernel) and (elements := drive.drive.elements) is not None:
         followed = replace(motion, deflections=deflections_of(motion, elements.widths, elements.acceleration))
     none = None if followed.deflections is None else np.zeros_like(followed.deflections)
-    dynamic = _dynamics_terms(model.estimator)
+    dynamic = dynamics_terms(model.estimator)
     rest = replace(motion, dq=zero, ddq=zero, deflections=none)
-    kernel = SumKernel(*dynamic, *_gains(drive))
+    kernel = SumKernel(*dynamic, *gains(model.estimator))
     parts = [Combination(kernel, [followed, rest], np.concatenate([eye, -eye], axis=1))]
     for term in terms.values():
         if term not in dynamic:
@@ -192,11 +194,6 @@ def _without_gravity(model: TorqueModel, motion: Motion) -> Estimate:
         variance = np.maximum(found.std**2 + posterior.misfit.variance(motion), posterior.floor)
         found = replace(found, std=np.sqrt(variance))
     return found
-
-
-def _gains(drive: TorqueKernel | None) -> list[TorqueKernel]:
-    """Return the errors of torque constants, which scale gravity and inertia as the recording reads them."""
-    return [drive.gain()] if isinstance(drive, DriveKernel) and "gain" in drive.drive.kinds else []
 
 
 def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Array:
@@ -237,22 +234,8 @@ def _push(motion: Motion, joint: int) -> Motion:
     return replace(motion, dq=zero, ddq=push)
 
 
-def _with_fixed_deflections(estimator: Estimator, motion: Motion) -> Motion:
-    """Return the motion with deflections that do not depend on ddq. Alternative arms differ in friction."""
-    friction = estimator.terms.get("friction")
-    if not isinstance(friction, DriveKernel) or (elements := friction.drive.elements) is None:
-        return motion
-    known = deflections_of(replace(motion, ddq=np.zeros_like(motion.q)), elements.widths, elements.acceleration)
-    known[:, len(elements.widths) :] = 0.0
-    return replace(motion, deflections=known)
-
-
-def _dynamics_terms(estimator: Estimator) -> list[TorqueKernel]:
-    return [term for name, term in estimator.terms.items() if name not in ("friction", "local", "others")]
-
-
 def _energy_terms(estimator: Estimator) -> list[EnergyKernel]:
-    return [term for term in _dynamics_terms(estimator) if isinstance(term, EnergyKernel)]
+    return [term for term in dynamics_terms(estimator) if isinstance(term, EnergyKernel)]
 
 
 def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Array | None) -> list[ComponentName]:

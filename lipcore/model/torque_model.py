@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.motion import Motion, motion_arrays
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
@@ -18,7 +16,10 @@ from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.drive.play import ELEMENTS, PlayFollower, PlayState, element_widths, with_deflections
 from lipcore.kernels.drive.terms import SIGN_WIDTH
 from lipcore.kernels.geometry import Geometry
-from lipcore.model import external
+from lipcore.model import equation, external
+from lipcore.model.equation import LinearBodies
+from lipcore.model.functionals import Estimate
+from lipcore.model.prediction import Fallback, TorqueAnswer, TorquePrediction
 from lipcore.model.selection import Selection
 from lipcore.posterior.batch_mean import BatchMean
 from lipcore.posterior.compact import CompactPosterior
@@ -30,68 +31,6 @@ from lipcore.vocabulary import JointType, TorqueConvention
 
 MIN_BATCH = 16
 """States from which on the mean alone is faster without features, measured on a Panda."""
-
-
-@dataclass(frozen=True)
-class Fallback:
-    """Difference of torques from the posterior mean, if the training does not determine them.
-
-    Both arrays have the shape of the torques.
-    """
-
-    share: Array
-    """Share of the fallback in each torque, 0 to 1."""
-    mean: Array
-    """Posterior mean, N·m."""
-
-
-class TorqueAnswer(NamedTuple):
-    """Prediction for one query of n joints, N·m: see `TorquePrediction`. tau, tau_std: (n,); covariance: (n, n)."""
-
-    tau: Array
-    tau_std: Array | None
-    covariance: Array | None
-    fallback: Fallback | None
-
-    @property
-    def mean(self) -> Array:
-        """Posterior mean, (n,): equals `tau` unless it falls back."""
-        return self.tau if self.fallback is None else self.fallback.mean
-
-
-@dataclass(frozen=True)
-class TorquePrediction:
-    """Prediction for N queries of n joints, N·m.
-
-    The 95 % intervals of measurements are
-
-        tau ± 1.96 · scale · √(tau_std² + noise_std²)
-
-    Standard deviations and covariances are always those of the posterior.
-    """
-
-    tau: Array
-    """Torque, (N, n)."""
-    tau_std: Array
-    """Standard deviation of the function, (N, n)."""
-    noise_std: Array
-    """Standard deviation of the measurement noise, (n,)."""
-    scale: Array
-    """Factor on the half width of intervals, (n,)."""
-    covariance: Array | None = None
-    """Covariance of the function between joints, (N, n, n), if requested."""
-    fallback: Fallback | None = None
-    """Fallback, or None if every torque is the posterior mean."""
-
-    @property
-    def mean(self) -> Array:
-        """Posterior mean, (N, n): equals `tau` unless it falls back."""
-        return self.tau if self.fallback is None else self.fallback.mean
-
-    @property
-    def interval(self) -> TorqueDistribution:
-        """Parts of the intervals, for `lipcore.data.metrics.evaluate(tau, *prediction.interval)`."""
-        return TorqueDistribution(self.tau, self.tau_std, self.noise_std, self.scale)
 
 
 TrainingRange = dict[str, dict[str, list[float]]]
@@ -269,6 +208,66 @@ class TorqueModel:
         run_parts(len(motion), run_part)
         return out
 
+    def gravity(self, q: ArrayLike) -> Estimate:
+        """Return the torque that holds the arm against gravity, g(q), and its standard deviation.
+
+        M(q) ddq + c(q, dq) + g(q) is the torque without friction and correction, as the recording would read it. A
+        payload of the model is included.
+
+        Args:
+            q: Positions, (n,) or (N, n), rad (m).
+
+        Returns:
+            Mean and standard deviation, shaped as q, N·m (N).
+
+        Raises:
+            UnavailableComponentError: The model was trained on torque without gravity, or cannot separate gravity.
+            ValueError: The number of joints is wrong, or a value is not finite.
+
+        Example: the torque of a computed-torque controller.
+
+            tau = model.mass_matrix(q) @ ddq + model.coriolis(q, dq) + model.gravity(q).mean
+
+        """
+        query = self._checked(q, q, q, None)
+        found, shape = equation.gravity(self, query.q), np.shape(q)
+        return Estimate(found.mean.reshape(shape), found.std.reshape(shape))
+
+    def coriolis(self, q: ArrayLike, dq: ArrayLike) -> Array:
+        """Return the Coriolis and centrifugal torque c(q, dq); see `gravity`.
+
+        Args:
+            q: Positions, (n,) or (N, n), rad (m).
+            dq: Velocities, same shape, rad/s (m/s).
+
+        Returns:
+            Mean torque, shaped as q, N·m (N).
+
+        Raises:
+            UnavailableComponentError: The model cannot separate it from friction.
+            ValueError: The number of joints is wrong, the shapes differ, or a value is not finite.
+
+        """
+        query = self._checked(q, dq, dq, None)
+        return equation.coriolis(self, query.q, query.dq).reshape(np.shape(q))
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """Return the mass matrix M(q), with the inertia of the rotors; see `gravity`.
+
+        Args:
+            q: Positions, (n,) or (N, n), rad (m).
+
+        Returns:
+            Mean, symmetric, (n, n) or (N, n, n): kg·m² if both joints are revolute.
+
+        Raises:
+            UnavailableComponentError: The torque of the estimator is not affine in the acceleration.
+            ValueError: The number of joints is wrong, or a value is not finite.
+
+        """
+        query = self._checked(q, q, q, None)
+        return equation.mass_matrix(self, query.q).reshape(*np.shape(q), self.n_joints)
+
     def predict_along(self, samples: Samples, covariance: bool = False) -> TorquePrediction:
         """Return the torque along recordings: rows are in order of time in each episode, and friction follows them.
 
@@ -345,6 +344,11 @@ class TorqueModel:
         model = replace(self)
         model.__dict__["evaluator"] = self.evaluator.fast()  # fill the cached property
         return model
+
+    @cached_property
+    def linear_bodies(self) -> LinearBodies | None:
+        """The torque without friction and correction, or None for a model with a nonlinear term."""
+        return LinearBodies(self.posterior) if self.separates_gravity else None
 
     def _checked(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, deflections: Array | None) -> Motion:
         """Return N states; raise ValueError like `predict`."""

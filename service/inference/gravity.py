@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
-from lipcore.data.motion import Motion
-from lipcore.model import dynamics
-from lipcore.vocabulary import ENERGY_ESTIMATORS, offered_components
+from lipcore.model.equation import UnavailableComponentError
 from service.contract.predictions import GravityRequest, GravityResponse
 from service.foundation.errors import invalid_request
 from service.inference.predicting import Query, check_answer, check_count, check_shapes, model_with_payload
 from service.models.loaded import LoadedModels, ServedModel
+
+
+@contextmanager
+def explain_unavailable(model: str) -> Iterator[None]:
+    """Raise InvalidRequestError instead of UnavailableComponentError in the block. model: name of the model."""
+    try:
+        yield
+    except UnavailableComponentError as error:
+        raise invalid_request("model", model, error.expected, str(error)) from error
 
 
 def gravity(
@@ -23,26 +33,18 @@ def gravity(
     """
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
-    if known.torque_convention == "gravity_compensated":
-        message = f"`{model}` has no gravity: it was trained on torque without gravity (`gravity_compensated`)."
-        raise invalid_request("model", model, "a model of torque with gravity", message)
-    if "gravity" not in offered_components(known.estimator.name):
-        expected = f"a model of estimator {', '.join(ENERGY_ESTIMATORS)}"
-        message = f"`{model}` cannot separate gravity from other torque: its estimator is {known.estimator.name}."
-        raise invalid_request("model", model, expected, message)
     (q,) = check_shapes(request, known)
-    single, q = q.ndim == 1, np.atleast_2d(q)
+    q = np.atleast_2d(q)
     check_count("q", f"{len(q)} queries", len(q), components=True)
-    Query(q[None], single).check(known.position_limits(loaded.storage.settings.max_position))
-    rest = np.zeros_like(q)
-    found = dynamics.components(model_with_payload(served, request.payload), Motion(q, rest, rest), ["gravity"])
-    mean, std = (each[0] if single else each for each in (found["gravity"].mean, found["gravity"].std))
-    check_answer("mean", mean)
+    Query(q[None], request.q.ndim == 1).check(known.position_limits(loaded.storage.settings.max_position))
+    with explain_unavailable(model):
+        found = model_with_payload(served, request.payload).gravity(request.q)
+    check_answer("mean", found.mean)
     return GravityResponse(
         model=served.name,
         version=served.version,
         revision=served.revision,
         joint_names=list(known.joint_names),
-        mean=mean.tolist(),
-        std=std.tolist(),
+        mean=found.mean.tolist(),
+        std=found.std.tolist(),
     )

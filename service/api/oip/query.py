@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.model.external import external
-from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePrediction
+from lipcore.model.prediction import TorqueAnswer, TorquePrediction
+from lipcore.model.torque_model import TorqueModel
 from lipcore.model.wrench import has_wrench
 from lipcore.vocabulary import COMPONENTS, ComponentName, offered_components
 from service.api.oip import schema

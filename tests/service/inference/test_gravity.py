@@ -1,6 +1,7 @@
 """Gravity over HTTP: lipcore's component without dq and ddq, or an error that explains."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from lipcore.model import dynamics
 from lipserve import ApiError
 from service.contract.predictions import GravityRequest
 from service.foundation.errors import InvalidRequestError
+from service.foundation.settings import Settings
 from service.inference.gravity import gravity
 from tests import ROOT
 from tests.clients.python.conftest import over
@@ -61,7 +63,8 @@ class Loaded:
     """Versions in memory, of which one has this model."""
 
     def __init__(self, model):
-        self.model = model
+        self.model = self.default_model = model
+        self.storage = SimpleNamespace(settings=Settings())
 
     def get(self, *_):
         return self

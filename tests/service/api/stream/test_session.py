@@ -8,7 +8,7 @@ from unittest.mock import AsyncMock
 import numpy as np
 import pytest
 
-from lipcore.model.torque_model import Fallback, TorqueAnswer
+from lipcore.model.prediction import Fallback, TorqueAnswer
 from service.api.errors import UNEXPECTED_ERROR
 from service.api.stream.session import Echo, Session
 from service.foundation.settings import Settings

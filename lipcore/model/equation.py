@@ -1,0 +1,172 @@
+"""Terms of the equation of motion: gravity g(q), Coriolis torque c(q, dq) and mass matrix M(q).
+
+The torque is M(q) ddq + c(q, dq) + g(q), plus friction and a correction. The first three follow from f, the torque
+without friction and correction (docs/method.md, section 5), since f is affine in ddq:
+
+    g(q) = f(q, 0, 0),     c(q, dq) = f(q, dq, 0) − g(q),     M(q) e_j = f(q, 0, e_j) − g(q).
+
+M is the symmetric part: errors of the torque constants make the two sides differ.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lipcore.data.motion import Array, Motion
+from lipcore.estimators.catalogue import Estimator
+from lipcore.kernels.base import LinearKernel, SumKernel, TorqueKernel
+from lipcore.kernels.drive.kernel import DriveKernel
+from lipcore.kernels.drive.play import deflections_of
+from lipcore.kernels.mixture import MixtureKernel
+from lipcore.kernels.residual import ResidualKernel
+from lipcore.model.functionals import Estimate, combine_torques
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.vocabulary import ENERGY_ESTIMATORS
+
+if TYPE_CHECKING:
+    from lipcore.model.torque_model import TorqueModel
+
+AFFINE_ESTIMATORS = (*ENERGY_ESTIMATORS, "gip")
+"""Estimators whose torque is affine in ddq."""
+
+
+class UnavailableComponentError(ValueError):
+    """The component does not exist, or the model does not have it. expected: models that have it."""
+
+    def __init__(self, message: str, expected: str = "") -> None:
+        super().__init__(message)
+        self.expected = expected
+
+
+def gravity(model: TorqueModel, q: Array) -> Estimate:
+    """Return gravity and its standard deviation at N positions; see `TorqueModel.gravity`."""
+    if model.torque_convention == "gravity_compensated":
+        raise UnavailableComponentError(
+            "This model has no gravity: it was trained on torque without gravity (`gravity_compensated`).",
+            "a model of torque with gravity",
+        )
+    _check_energies(model, "gravity")
+    rest = np.zeros_like(q)
+    motion = with_fixed_deflections(model.estimator, Motion(q, rest, rest))
+    if model.linear_bodies is not None:
+        return model.linear_bodies.estimate(motion.arrays())
+    return combine_torques(model.posterior, _bodies(model.estimator), [motion], np.eye(model.n_joints))
+
+
+def coriolis(model: TorqueModel, q: Array, dq: Array) -> Array:
+    """Return the Coriolis torque at N states, (N, n); see `TorqueModel.coriolis`."""
+    _check_energies(model, "the Coriolis torque")
+    rest = np.zeros_like(q)
+    moving = with_fixed_deflections(model.estimator, Motion(q, dq, rest))
+    torques = _torques(model, [moving, replace(moving, dq=rest)])
+    return np.asarray(torques[0] - torques[1])
+
+
+def mass_matrix(model: TorqueModel, q: Array) -> Array:
+    """Return the mass matrix at N positions, (N, n, n); see `TorqueModel.mass_matrix`."""
+    if model.estimator.name not in AFFINE_ESTIMATORS:
+        raise UnavailableComponentError(
+            f"This model has no mass matrix: its estimator is {model.estimator.name}, whose torque is not affine in "
+            "the acceleration.",
+            f"a model of estimator {', '.join(AFFINE_ESTIMATORS)}",
+        )
+    rest = np.zeros_like(q)
+    still = with_fixed_deflections(model.estimator, Motion(q, rest, rest))
+    pushes = [replace(still, ddq=rest + unit) for unit in np.eye(model.n_joints)]
+    torques = _torques(model, [still, *pushes])
+    columns = torques[1:] - torques[0]  # (n, N, n)
+    return np.asarray(0.5 * (columns.transpose(1, 2, 0) + columns.transpose(1, 0, 2)))
+
+
+class LinearBodies:
+    """Torque without friction and correction, Φ w, of a posterior that is linear in its weights.
+
+    It is thread-safe. The numbers are those of `lipcore.model.dynamics`, in a small part of the time.
+    """
+
+    def __init__(self, posterior: CompactPosterior) -> None:
+        terms = [term for term in posterior.basis.linear if not isinstance(term, ResidualKernel)]
+        # a correction is before the other terms
+        self._columns = columns = slice(posterior.basis.rows(terms[0]).start, len(posterior.basis))
+        mask = np.concatenate([_body_weights(term, posterior.basis.rows(term)) for term in terms])
+        self._fills, self._size, self._std_factor = [], len(mask), posterior.std_factor
+        for term in terms:
+            rows = posterior.basis.rows(term)
+            if mask[rows.start - columns.start : rows.stop - columns.start].any():
+                self._fills.append((rows.start - columns.start, term.regressor().fill_many))
+        self._slopes = posterior.slopes[columns] * mask
+        # the root is lower triangular: above these rows, these columns are zero
+        self._root = posterior.feature_root[columns, columns] * mask
+
+    def torques(self, motions: Array) -> Array:
+        """Return the mean torques at N instants, (N, n). motions: as of `Motion.arrays`."""
+        return self._mean(self._features(motions))
+
+    def estimate(self, motions: Array) -> Estimate:
+        """Return the torques at N instants and their standard deviations, (N, n) each."""
+        features = self._features(motions)
+        std = self._std_factor * np.sqrt(np.square(self._root @ features).sum(axis=1))
+        return Estimate(self._mean(features), std)
+
+    def _mean(self, features: Array) -> Array:
+        return np.asarray((self._slopes @ features.swapaxes(0, 1).reshape(self._size, -1)).reshape(len(features), -1))
+
+    def _features(self, motions: Array) -> Array:
+        features = np.zeros((len(motions), self._size, motions.shape[2]))
+        for first, fill_many in self._fills:
+            fill_many(motions, features, first)
+        return features
+
+
+def dynamics_terms(estimator: Estimator) -> list[TorqueKernel]:
+    """Return the terms of an estimator without friction, correction and alternative arms."""
+    return [term for name, term in estimator.terms.items() if name not in ("friction", "local", "others")]
+
+
+def gains(estimator: Estimator) -> list[TorqueKernel]:
+    """Return the errors of torque constants, which scale gravity and inertia as the recording reads them."""
+    drive = estimator.terms.get("friction")
+    return [drive.gain()] if isinstance(drive, DriveKernel) and "gain" in drive.drive.kinds else []
+
+
+def with_fixed_deflections(estimator: Estimator, motion: Motion) -> Motion:
+    """Return the motion with deflections that do not depend on ddq. Alternative arms differ in friction."""
+    friction = estimator.terms.get("friction")
+    if not isinstance(friction, DriveKernel) or (elements := friction.drive.elements) is None:
+        return motion
+    known = deflections_of(replace(motion, ddq=np.zeros_like(motion.q)), elements.widths, elements.acceleration)
+    known[:, len(elements.widths) :] = 0.0
+    return replace(motion, deflections=known)
+
+
+def _torques(model: TorqueModel, motions: list[Motion]) -> Array:
+    """Return the mean torques without friction and correction of S motions of N instants, (S, N, n)."""
+    stacked, bodies = np.concatenate([each.arrays() for each in motions]), model.linear_bodies
+    if bodies is not None:
+        found = bodies.torques(stacked)
+    else:
+        found = model.posterior.mean(Motion.of(stacked), _bodies(model.estimator))
+    return found.reshape(len(motions), -1, model.n_joints)
+
+
+def _bodies(estimator: Estimator) -> TorqueKernel:
+    """Return the terms of f."""
+    return SumKernel(*dynamics_terms(estimator), *gains(estimator))
+
+
+def _body_weights(term: LinearKernel, rows: slice) -> Array:
+    """Return 1 for the weights of bodies and gains, 0 for those of friction and alternative arms, (p,)."""
+    if isinstance(term, DriveKernel):
+        return term.gains.astype(np.float64)
+    return np.full(rows.stop - rows.start, float(not isinstance(term, MixtureKernel)))
+
+
+def _check_energies(model: TorqueModel, what: str) -> None:
+    if model.estimator.name not in ENERGY_ESTIMATORS:
+        raise UnavailableComponentError(
+            f"This model cannot separate {what} from other torque: its estimator is {model.estimator.name}.",
+            f"a model of estimator {', '.join(ENERGY_ESTIMATORS)}",
+        )
