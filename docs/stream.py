@@ -28,6 +28,7 @@ CHAPTERS = {
     "Every request gets": "Texts",
     "Deadlines. ": "Deadlines",
     "Fallback. ": "Fallback",
+    "Parts. ": "Gravity, mass matrix and Coriolis torque",
     "External torque is": "External torque",
     "Learning. ": "Learning",
     "Query parameters of": "The address",
@@ -77,8 +78,8 @@ REQUEST_FIELDS = ("sequence", "flags", "n", "deadline")
 ANSWER_FIELDS = ("sequence", "flags", "n", "version", "late_answers", "revision", "seconds")
 ARRAYS = {
     "request": ("q", "dq", "ddq", "tau"),
-    "answer": ("tau", "tau_std", "scale", "external_tau", "external_std", "external_z", "external_statistic",
-               "external_p", "payload"),
+    "answer": ("gravity", "gravity_std", "mass_matrix", "coriolis", "tau", "tau_std", "scale", "external_tau",
+               "external_std", "external_z", "external_statistic", "external_p", "payload"),
 }  # fmt: skip
 
 
@@ -96,7 +97,7 @@ def _protocol(text: str) -> Iterator[str]:
     for paragraph in text.strip().split("\n\n")[1:]:
         for start in [start for start in left if paragraph.startswith(start)]:
             yield f"## {left.pop(start)}\n"
-        yield re.sub(r"^(Deadlines|Fallback|Learning|Flow control)\. ", "", paragraph) + "\n"
+        yield re.sub(r"^(Deadlines|Fallback|Parts|Learning|Flow control)\. ", "", paragraph) + "\n"
     if left:
         raise ValueError(f"clients/python/lipserve/frames.py has no paragraph that starts with {list(left)}")
 

@@ -134,7 +134,7 @@ def connected(url: str) -> Iterator[Client]:
     """Yield a client of the service at `url`; raise CommandError with a hint if it fails or refuses a request."""
     # slow imports, not needed for help
     from lipserve import ApiError, Client, ServiceUnreachableError  # noqa: PLC0415
-    from lipserve.exchange import StreamError  # noqa: PLC0415
+    from lipserve.answers import StreamError  # noqa: PLC0415
 
     try:
         with Client(url) as client:

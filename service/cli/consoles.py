@@ -110,7 +110,7 @@ def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Exp
 
 def _refusals() -> tuple[type[Exception], ...]:
     """Return the error classes that carry an answer of the service."""
-    return _imported({"lipserve.sending": "ApiError", "lipserve.exchange": "StreamError"})
+    return _imported({"lipserve.sending": "ApiError", "lipserve.answers": "StreamError"})
 
 
 def _missing() -> tuple[type[Exception], ...]:

@@ -24,7 +24,7 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.vocabulary import TorqueConvention
 from lipserve import StreamClient, StreamError
-from lipserve.exchange import StreamAnswer, StreamLearnt, StreamRefusal
+from lipserve.answers import StreamAnswer, StreamLearnt, StreamRefusal
 from service.cli.consoles import CommandError
 from service.cli.wording import in_shell
 from service.datasets.formats.opening import open_table

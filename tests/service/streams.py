@@ -23,7 +23,10 @@ from tests.service.data import DEADLINE
 from tests.service.server import Server
 
 STD, LATE, ERROR, UNREAD, SCALE, EXTERNAL, PAYLOAD, FALLBACK = 1, 2, 4, 8, 16, 32, 64, 128
+GRAVITY, MASS_MATRIX, CORIOLIS = 256, 512, 1024
+PARTS = GRAVITY | MASS_MATRIX | CORIOLIS
 LEARN, ASK_EXTERNAL = 2, 4
+ASK_GRAVITY, ASK_MASS_MATRIX, ASK_CORIOLIS = 8, 16, 32
 STREAM = "/v1/models/pendulum/stream"
 MOTION = np.array([[0.3, -0.2], [0.1, 0.4], [1.0, -0.5]])
 TAU = np.array([5.0, -2.0])
@@ -53,6 +56,7 @@ class Answer:
     scale: np.ndarray | None = None
     external: np.ndarray | None = None
     payload: np.ndarray | None = None
+    part: np.ndarray | None = None
     error: dict[str, Any] | None = None
 
 
@@ -65,7 +69,10 @@ def frame(
     tau: Any = None,
     learn: bool = True,
 ) -> bytes:
-    """Return a request frame; motion: q, dq, ddq; tau: measured torque, to be learnt unless `learn` is false."""
+    """Return a request frame.
+
+    motion: q, dq, ddq, or those that a part needs; tau: measured torque, to be learnt unless `learn` is false.
+    """
     numbers = np.asarray(motion, "<f8")
     n = numbers.shape[-1] if n is None else n
     torque = b"" if tau is None else np.asarray(tau, "<f8").tobytes()
@@ -80,7 +87,7 @@ def read(data: bytes) -> Answer:
     """Parse an answer frame, and check that its length matches its header."""
     assert isinstance(data, bytes)
     sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
-    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL | PAYLOAD | FALLBACK) == 0
+    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL | PAYLOAD | FALLBACK | PARTS) == 0
     assert seconds >= 0
     reply = Answer(sequence, flags, version, late, revision, seconds)
     if flags & ERROR:
@@ -89,7 +96,7 @@ def read(data: bytes) -> Answer:
         assert set(body) == {"error"}
         assert set(body["error"]) == {"code", "message", "detail"}
         return Answer(**{**vars(reply), "error": body["error"]})
-    lengths = {"tau": n}
+    lengths = {"part": n * n if flags & MASS_MATRIX else n} if flags & PARTS else {"tau": n}
     lengths |= {"std": n} if flags & STD else {}
     lengths |= {"scale": n} if flags & SCALE else {}
     lengths |= {"external": 3 * n + 2} if flags & EXTERNAL else {}

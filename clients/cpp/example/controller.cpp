@@ -67,6 +67,9 @@ int main(int count, char** arguments) {
 
   Rehearsal robot;
   lipserve::Answer answer;
+  if (client.gravity(robot.q, answer, Deadline::in(1.0)) == Status::ok)
+    for (unsigned k = 0; k < joints; ++k)
+      std::printf("gravity at joint %u: %.2f +- %.2f N m\n", k + 1, answer.gravity[k], 1.96 * answer.gravity_std[k]);
   long used = 0, unsure = 0, missed = 0, kept = 0;
   std::int64_t due = Deadline::now().ns;
   for (long cycle = 0; cycle < cycles; ++cycle) {

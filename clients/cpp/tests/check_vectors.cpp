@@ -72,6 +72,7 @@ void check_request(const Fields& fields, const Bytes& bytes) {
   lipserve::Query query{parts["q"].data(), parts["dq"].data(), parts["ddq"].data()};
   if (parts.count("tau")) query.tau = parts["tau"].data();
   query.std = flags & 1, query.learn = flags & 2, query.external = flags & 4;
+  query.kind = static_cast<lipserve::Kind>(flags & 56U);
   query.budget = std::strtod(fields.at("deadline").c_str(), nullptr);
   Bytes made(frames::request_bytes(2, true));
   made.resize(frames::write(made.data(), static_cast<std::uint32_t>(whole(fields, "sequence")), query, 2));
@@ -91,6 +92,10 @@ void check_answer(const Fields& fields, const Bytes& bytes) {
   const std::map<std::string, const double*> arrays{{"tau", seen.tau},
                                                     {"tau_std", seen.tau_std},
                                                     {"scale", seen.scale},
+                                                    {"gravity", seen.gravity},
+                                                    {"gravity_std", seen.gravity_std},
+                                                    {"mass_matrix", seen.mass_matrix},
+                                                    {"coriolis", seen.coriolis},
                                                     {"external_tau", seen.tau_external},
                                                     {"external_std", seen.tau_external_std},
                                                     {"external_z", seen.tau_external_z}};

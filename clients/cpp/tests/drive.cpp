@@ -2,6 +2,7 @@
 //
 // Client for tests. It reads commands from standard input, one per line, and answers each with a line of JSON:
 //     connect SECONDS | ask ROW SECONDS [std|learn|external …] | teach FROM TO | flush SECONDS | tick | close | end
+//     gravity ROW SECONDS | mass_matrix ROW SECONDS | coriolis ROW SECONDS
 //     loop CYCLES PERIOD_US BUDGET_US FIRST_ROW    calls `ask` and `teach` in every cycle; prints "cycle" in the middle
 //     loop-ask CYCLES PERIOD_US BUDGET_US FIRST_ROW    only calls `ask`
 // Options are arguments of the form name=value. rows=FILE: rows of 4 · joints doubles: q, dq, ddq, tau. alarms=1: a
@@ -112,6 +113,20 @@ class Driver {
       lipserve::Answer answer;
       status = watched([&] { return client_.ask(query, answer, Deadline::in(seconds)); });
       if (status == Status::ok) say(answer);
+    } else if (word == "gravity" || word == "mass_matrix" || word == "coriolis") {
+      line >> from >> seconds;
+      const lipserve::Query at = row(from);
+      const Deadline until = Deadline::in(seconds);
+      lipserve::Answer part;
+      status = watched([&] {
+        if (word == "gravity") return client_.gravity(at.q, part, until);
+        return word == "coriolis" ? client_.coriolis(at.q, at.dq, part, until) : client_.mass_matrix(at.q, part, until);
+      });
+      if (part.gravity) more_ += member("mean", list(part.gravity, joints_));
+      if (part.gravity_std) more_ += member("std", list(part.gravity_std, joints_));
+      if (part.coriolis) more_ += member("mean", list(part.coriolis, joints_));
+      if (part.mass_matrix) more_ += member("mean", list(part.mass_matrix, joints_ * joints_));
+      more_ += member("late", part.late) + member("has_tau", part.tau != nullptr);
     } else if (word == "teach") {
       line >> from >> to;
       for (; from < to && status == Status::ok; ++from) {

@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lipserve.alarms import AlarmEvent, SignatureError, read_alarm_event
+    from lipserve.answers import StreamError
     from lipserve.asynchronous import AsyncClient
-    from lipserve.exchange import StreamError
+    from lipserve.asynchronous_stream import AsyncStreamClient
     from lipserve.results.evaluation import Comparison, Evaluation
     from lipserve.results.series import Component, LiveRows, Prediction, Preview, Trace, Wrench
     from lipserve.sending import ApiError, ServiceUnreachableError
-    from lipserve.stream import AsyncStreamClient, StreamClient
+    from lipserve.stream import StreamClient
     from lipserve.sync import Client
 
 __version__ = "0.2.0"
@@ -32,7 +33,7 @@ _HOMES = {
     "AlarmEvent": "alarms",
     "ApiError": "sending",
     "AsyncClient": "asynchronous",
-    "AsyncStreamClient": "stream",
+    "AsyncStreamClient": "asynchronous_stream",
     "Client": "sync",
     "Comparison": "results.evaluation",
     "Component": "results.series",
@@ -43,7 +44,7 @@ _HOMES = {
     "ServiceUnreachableError": "sending",
     "SignatureError": "alarms",
     "StreamClient": "stream",
-    "StreamError": "exchange",
+    "StreamError": "answers",
     "Trace": "results.series",
     "Wrench": "results.series",
     "read_alarm_event": "alarms",

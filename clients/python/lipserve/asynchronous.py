@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lipserve import sending
+from lipserve.asynchronous_stream import AsyncStreamClient
 from lipserve.call import Answer, Call, Page, bound
 from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, reporting
 from lipserve.records.jobs import Job
 from lipserve.records.learning import Learning
 from lipserve.results.series import Component
-from lipserve.stream import AsyncStreamClient
 
 P = ParamSpec("P")
 T = TypeVar("T")

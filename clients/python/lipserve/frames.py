@@ -3,16 +3,18 @@
 Each frame is one binary message, little-endian and without padding; numbers are 8-byte aligned. n is the number of
 joints.
 
-Request, 16 + 24 n bytes, or 16 + 32 n with tau:
+Request, 16 + 24 n bytes, or 16 + 32 n with tau; 16 + 8 n with flag 8 or 16, 16 + 16 n with flag 32:
 
     offset  type     field
     0       u32      sequence: chosen by the client, repeated in the answer
-    4       u16      flags: 1 = return tau_std; 2 = learn from tau; 4 = return the external torque of tau
+    4       u16      flags: 1 = return tau_std; 2 = learn from tau; 4 = return the external torque of tau; instead of
+                     the torque, return 8 = gravity, 9 = gravity and its standard deviation, 16 = the mass matrix,
+                     32 = the Coriolis torque
     6       u16      n
     8       f64      deadline in s after the frame's arrival in the service; 0 = none
     16      f64 n    q, rad (prismatic: m)
-    …       f64 n    dq, rad/s (m/s)
-    …       f64 n    ddq, rad/s² (m/s²)
+    …       f64 n    dq, rad/s (m/s); not with flag 8 or 16
+    …       f64 n    ddq, rad/s² (m/s²); not with flag 8, 16 or 32
     …       f64 n    with flag 2 or 4: tau, N·m (prismatic: N), measured at this motion
 
 The arrays of a request begin at 16 (q), 16 + 8 n (dq), 16 + 16 n (ddq) and 16 + 24 n (tau).
@@ -23,7 +25,8 @@ Answer, 32 + 8 n bytes; plus 8 n with tau_std, 8 n with scale, 24 n + 16 with ex
     0       u32      sequence of the request
     4       u16      flags: 1 = has tau_std after tau; 2 = late; 4 = error; 8 = no sequence;
                      16 = has scale; 32 = has external torque; 64 = has payload, at the end;
-                     128 = fallback: training does not, or not fully, determine some torque
+                     128 = fallback: training does not, or not fully, determine some torque;
+                     256 = gravity, 512 = mass matrix, 1024 = Coriolis torque, instead of tau
     6       u16      n; 0 in an error
     8       u32      serving version
     12      u32      late answers of this connection so far
@@ -43,6 +46,10 @@ Answer, 32 + 8 n bytes; plus 8 n with tau_std, 8 n with scale, 24 n + 16 with ex
     …       f64 2    payload, if requested: estimated payload mass of this stream_id, mean and standard deviation, kg;
                      both NaN without a payload
 
+An answer with flag 256 has gravity, N·m, and with flag 1 its standard deviation; with flag 1024, the Coriolis torque,
+N·m; with flag 512, the n × n mass matrix row by row, kg·m² (rotors included, symmetric). It has no scale, external
+torque or payload.
+
 An error has the same header, followed by UTF-8 JSON: {"error": {code, message, detail}}. The connection stays open.
 Flag 8: the request was too short or not a binary message, so its sequence is unknown (0 in the answer).
 
@@ -59,6 +66,10 @@ for its client too.
 Fallback. With flag 128, training does not determine some joint's torque at this motion. This torque falls back to
 gravity, offset and friction, or to the training mean. The `fallback` of `POST /v1/models/{model}/predict` has the share
 per joint. tau_std, external torque and learning are those of the full model.
+
+Parts. M(q) ddq + Coriolis torque + gravity + friction is the torque, without the correction of `rigid-body+local`. They
+include the payload of this stream_id. Without an energy, as with the estimators `se` and `lse`, they are refused; so is
+gravity of a model of gravity-compensated torque.
 
 External torque is not a safety function. It is the torque that the model does not explain: a contact, a payload, or an
 error of the sensor or of the model. It needs a finite tau. Without flag 2, nothing is learnt from it.
@@ -119,6 +130,12 @@ REQUEST = Struct("<IHHd")
 ASK_STD = 1
 ASK_LEARN = 2
 ASK_EXTERNAL = 4
+ASK_GRAVITY = 8
+ASK_MASS_MATRIX = 16
+ASK_CORIOLIS = 32
+VECTORS = {0: 3, ASK_STD: 3, **dict.fromkeys(range(ASK_LEARN, ASK_GRAVITY), 4)}
+VECTORS |= {ASK_GRAVITY: 1, ASK_GRAVITY | ASK_STD: 1, ASK_MASS_MATRIX: 1, ASK_CORIOLIS: 2}
+"""Number of vectors of a request by its flags: the first of q, dq, ddq and tau."""
 
 ANSWER = Struct("<IHHIIQd")
 """sequence, flags, n, version, late answers, revision, seconds."""
@@ -130,10 +147,13 @@ HAS_SCALE = 16
 HAS_EXTERNAL = 32
 HAS_PAYLOAD = 64
 FALLBACK = 128
+HAS_GRAVITY = 256
+HAS_MASS_MATRIX = 512
+HAS_CORIOLIS = 1024
 
 NUMBER = "<f8"
 
 
-def request_bytes(n_joints: int, torque: bool = False) -> int:
-    """Return the size of a request in bytes. torque: with tau."""
-    return REQUEST.size + (4 if torque else 3) * 8 * n_joints
+def request_bytes(n_joints: int, flags: int = 0) -> int:
+    """Return the size of a request in bytes. flags: a key of VECTORS."""
+    return REQUEST.size + 8 * VECTORS[flags] * n_joints

@@ -13,7 +13,8 @@ from uvicorn.protocols.utils import ClientDisconnected
 
 from service.api.access.scopes import ADMIN, PREDICT, Rule
 from service.api.server.connections import CONNECTION, StreamProtocol
-from service.api.stream.session import Conversation, Echo, Session
+from service.api.stream.conversation import Conversation, Echo
+from service.api.stream.session import Session
 from service.contract.models import ALIAS
 from service.contract.predictions import one_choice
 from service.foundation.errors import NotFoundError, NotReadyError, invalid_request, readable

@@ -1,14 +1,10 @@
-"""Conversations over one WebSocket connection: the echo, and streams of torque queries that can also be learnt from."""
+"""Streams of torque queries that can also be learnt from."""
 
 from __future__ import annotations
 
-import asyncio
 import json
 import logging
-from abc import ABC, abstractmethod
-from collections import deque
-from contextlib import suppress
-from math import inf, nan
+from math import nan
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -21,15 +17,15 @@ from lipcore.kernels.drive.play import PlayFollower, element_widths
 from lipcore.model import dynamics
 from lipcore.model.external import external
 from lipcore.vocabulary import offered_components
-from service.api.access.middleware import subprotocol_of
 from service.api.errors import UNEXPECTED_ERROR
-from service.api.limits.requests import PATIENCE
 from service.api.server.connections import StreamProtocol
+from service.api.stream.conversation import Conversation
 from service.api.stream.learning import FrameLearning, LearningFrame
+from service.api.stream.parts import answer_part
+from service.api.stream.reading import FrameReader
 from service.contract import frames
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
-from service.foundation.settings import Settings
-from service.inference.predicting import Query, check_answer
+from service.inference.predicting import check_answer
 from service.learning.learners import Learners
 from service.models.loaded import ServedModel
 from service.models.registry import SERVING
@@ -39,146 +35,6 @@ if TYPE_CHECKING:
     from lipcore.data.samples import Array
 
 logger = logging.getLogger(__name__)
-
-
-class Conversation(ABC):
-    """Answers messages in order, one at a time, and closes idle or unresponsive connections.
-
-    It uses ASGI directly: 1 µs per message, instead of 3 µs with Starlette's WebSocket. `left` is the time when the
-    last answer was written, in seconds of `time.perf_counter`.
-    """
-
-    def __init__(self, connection: StreamProtocol, receive: Receive, send: Send, settings: Settings) -> None:
-        self.connection, self.receive, self.send, self.settings = connection, receive, send, settings
-        self.left = perf_counter()
-        self._writing = False
-        self._texts: deque[str] = deque()
-        self._closing: asyncio.Task[None] | None = None
-
-    @abstractmethod
-    async def reply(self, message: Message, arrived: float) -> bytes:
-        """Return the answer to a message; `arrived` is a time of `time.perf_counter`."""
-
-    async def greet(self) -> None:
-        """Send what a client needs before its first message."""
-        return
-
-    async def run(self) -> None:
-        """Accept the connection and answer messages until either side closes it."""
-        receive, send, connection, reply = self.receive, self.send, self.connection, self.reply
-        await receive()
-        await send({"type": "websocket.accept", "subprotocol": subprotocol_of(connection.scope["subprotocols"])})
-        await self.greet()
-        self._watch()
-        try:
-            while True:
-                message = await receive()
-                arrived = connection.arrived
-                if message["type"] == "websocket.disconnect":
-                    return
-                answer = await reply(message, arrived)
-                self._writing = True
-                self.left = perf_counter()  # start of a possible wait for the client to read
-                await send({"type": "websocket.send", "bytes": answer})
-                self.left = perf_counter()
-                if self._texts:
-                    await self._write_texts()
-                self._writing = False
-                # with waiting messages, no call above yields to other tasks: a fast client must not block them
-                await asyncio.sleep(0)
-        finally:
-            self._timer.cancel()
-
-    async def send_text(self, text: str) -> None:
-        """Send a text now or after the answer that is being written. Only one caller at a time.
-
-        The connection of a client that does not read it is aborted. Nothing happens if the client has disconnected.
-        """
-        self._texts.append(text)
-        if self._writing:
-            return
-        with suppress(OSError, RuntimeError):  # disconnected, or closing: uvicorn's RuntimeError
-            try:
-                async with asyncio.timeout(PATIENCE.frame_s):
-                    await self._write_texts()
-            except TimeoutError:
-                self.connection.abort()
-
-    async def _write_texts(self) -> None:
-        while self._texts:
-            await self.send({"type": "websocket.send", "text": self._texts.popleft()})
-
-    def _watch(self) -> None:
-        period = min(self.settings.stream_idle_s, PATIENCE.frame_s)
-        self._timer = asyncio.get_running_loop().call_later(period, self._check_timeouts)
-
-    def _check_timeouts(self) -> None:
-        """Close a connection that is idle or does not read. A periodic check is cheaper than one timer per frame."""
-        waited = perf_counter() - self.left
-        if self._writing and waited >= PATIENCE.frame_s:
-            self.connection.abort()
-        elif not self._writing and waited >= self.settings.stream_idle_s:
-            self._closing = asyncio.get_running_loop().create_task(self._close_idle())
-        else:
-            self._watch()
-
-    async def _close_idle(self) -> None:
-        reason = f"no frame for {self.settings.stream_idle_s:g} s (LIPSERVE_STREAM_IDLE_S)"
-        with suppress(OSError):  # already disconnected
-            await self.send({"type": "websocket.close", "code": 1000, "reason": reason})
-
-
-class Echo(Conversation):
-    """Returns every message unchanged, to measure latency without computation."""
-
-    async def reply(self, message: Message, arrived: float) -> bytes:
-        """Return the message itself."""
-        text = message.get("text")
-        data: bytes = message["bytes"] if text is None else text.encode()
-        return data
-
-
-class FrameReader:
-    """Reads frames of one robot into a buffer, which the next frame overwrites."""
-
-    def __init__(self, joint_names: tuple[str, ...], position_limits: Array) -> None:
-        self.joint_names, self.n_joints, self._limits = joint_names, len(joint_names), position_limits
-        self.motion: Array = np.zeros((3, self.n_joints))
-        self._numbers, self._query = self.motion.reshape(-1), Query(self.motion[:, None], single=True)
-        self._lengths = {torque: frames.request_bytes(self.n_joints, torque) for torque in (False, True)}
-
-    def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
-        """Return q, dq, ddq of a frame with a header that was read before, (3, n); raise InvalidRequestError.
-
-        The presence of the torque is checked, but not its values: see `torque`.
-        """
-        if n != self.n_joints:
-            raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
-        if flags >= 2 * frames.ASK_EXTERNAL:
-            expected = (
-                f"a sum of {frames.ASK_STD} (return tau_std), {frames.ASK_LEARN} (learn from tau) and "
-                f"{frames.ASK_EXTERNAL} (return the external torque)"
-            )
-            raise invalid_request("flags", flags, expected)
-        length = self._lengths[torque := flags > frames.ASK_STD]
-        if len(data) != length:
-            expected = f"{length} bytes for {n} joints{' with tau' if torque else ''}"
-            raise invalid_request("frame", f"{len(data)} bytes long", expected)
-        if not 0.0 <= budget < inf:
-            raise invalid_request("deadline", budget, "a number of seconds, or 0 for none")
-        # a copy: the model needs aligned, writable memory, which the message may not be
-        self._numbers[:] = np.frombuffer(data, frames.NUMBER, 3 * n, frames.REQUEST.size)
-        self._query.check(self._limits)
-        return self.motion
-
-    def torque(self, data: bytes) -> Array:
-        """Return tau, (n,), of a frame checked by `read`; raise InvalidRequestError if it is not finite."""
-        tau = np.array(np.frombuffer(data, frames.NUMBER, self.n_joints, self._lengths[False]), np.float64)
-        finite = np.isfinite(tau)
-        if not finite.all():
-            joint = int(finite.argmin())
-            raise invalid_request(f"tau[{joint}]", f"{tau[joint]:g}", "a finite number")
-        return tau
 
 
 class Session(Conversation):
@@ -270,6 +126,10 @@ class Session(Conversation):
             if current is not self._served or self._payloads.model_for(self._stream_id) is not self._payload_model:
                 await self._update_version(current)
             motion = self._reader.read(data, asked, n, budget)
+            if asked >= frames.ASK_GRAVITY:
+                model = self._payload_model or self._served.model
+                part = await answer_part(self._name, model, asked | self._sends_std, motion)
+                return self._finished(sequence, *part, arrived, budget)
             if self._follower is not None:
                 self._follower.motion[: len(motion)] = motion
                 self._follower.step(arrived)
@@ -293,13 +153,17 @@ class Session(Conversation):
         except Exception as error:  # later frames may succeed
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
             return self._refuse(sequence, flags, arrived, ServiceError(UNEXPECTED_ERROR))
-        served = self._served
         flags, numbers = self._numbers(sequence, asked, arrived, data, tau, std, factor, more, mean)
         if reduced is not None:
             size = (2 if flags & frames.HAS_STD else 1) * tau.nbytes
             numbers = reduced.tobytes()[:size] + numbers[size:]
         if fallback is not None:
             flags |= frames.FALLBACK
+        return self._finished(sequence, flags, numbers, arrived, budget)
+
+    def _finished(self, sequence: int, flags: int, numbers: bytes, arrived: float, budget: float) -> bytes:
+        """Return the answer frame, and count it."""
+        served, n = self._served, self._reader.n_joints
         seconds = perf_counter() - arrived
         self._meter.durations.add(seconds)
         if seconds > (budget or self._deadline):

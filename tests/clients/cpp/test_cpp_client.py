@@ -83,6 +83,27 @@ def test_torque_without_gravity_has_its_own_deviation(driver, server, panda):
             np.testing.assert_allclose(report["tau_external"], row[3] - panda.answer(row[:3])[0], rtol=1e-9, atol=1e-9)
 
 
+def test_parts_match_the_model_and_leave_the_last_torque(driver, server, panda):
+    motions = panda_rows(3)
+    with Driver(driver, motions, url=server.url, scale=1, **PANDA) as client:
+        client.do(f"connect {FAR}")
+        torque = client.do(f"ask 0 {FAR}")["tau"]
+        for number, (q, dq, *_) in enumerate(motions):
+            gravity = panda.gravity(q)
+            report = client.do(f"gravity {number} {FAR}")
+            np.testing.assert_allclose(report["mean"], gravity.mean, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(report["std"], gravity.std, rtol=1e-9)
+            report = client.do(f"mass_matrix {number} {FAR}")
+            np.testing.assert_allclose(report["mean"], panda.mass_matrix(q).ravel(), rtol=1e-12, atol=1e-12)
+            report = client.do(f"coriolis {number} {FAR}")
+            np.testing.assert_allclose(report["mean"], panda.coriolis(q, dq), rtol=1e-12, atol=1e-12)
+            assert (report["late"], report["has_tau"], report["allocations"]) == (0, 0, 0)
+        report = client.do("gravity 1 0")
+        assert (report["status"], report["late"], report.get("mean")) == ("timeout", 1, None)
+        report = client.do(f"ask 0 {FAR}")
+        assert (report["status"], report["tau"]) == ("ok", torque)
+
+
 def test_ask_with_learn_learns_after_the_answer(driver, server, panda):
     measured = panda_rows(12)
     with Driver(driver, measured, url=server.url, stream_id="asked", **PANDA) as client:

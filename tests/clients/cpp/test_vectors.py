@@ -14,7 +14,8 @@ import pytest
 from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key, apply_mask
 
-from lipserve.exchange import Exchange, StreamError, read_answer
+from lipserve.answers import StreamAnswer, StreamError, StreamPart, read_answer
+from lipserve.exchange import Exchange
 from tests.clients.cpp.building import CPP, VECTORS, built, checked, fuzzes, here
 from tests.service.streams import read
 
@@ -48,7 +49,7 @@ def numbers(text: str) -> np.ndarray:
 
 def test_vectors_cover_every_kind():
     assert {kind: len(group) for kind, group in KINDS.items()} == {
-        "request": 4, "answer": 6, "error": 3, "text": 2, "websocket": 3, "handshake": 1,
+        "request": 7, "answer": 9, "error": 3, "text": 2, "websocket": 3, "handshake": 1,
     }  # fmt: skip
 
 
@@ -56,6 +57,11 @@ def test_vectors_cover_every_kind():
 def test_python_client_writes_requests(vector):
     flags, tau = int(vector["flags"]), vector.get("tau")
     exchange = Exchange("arm", int(vector["sequence"]))
+    if flags >= 8:
+        states = [numbers(vector[name]) for name in ("q", "dq") if name in vector]
+        made = exchange.part_frame(flags, float(vector["deadline"]), *states)
+        assert made == (int(vector["sequence"]), vector["bytes"])
+        return
     sequence, made = exchange.frame(
         *(numbers(vector[name]) for name in ("q", "dq", "ddq")),
         std=bool(flags & 1),
@@ -75,6 +81,15 @@ def test_python_client_reads_answers(vector):
         assert getattr(answer, name) == int(vector[name])
     assert answer.seconds == float(vector["seconds"])
     assert answer.late == bool(int(vector["flags"]) & 2)
+    if isinstance(answer, StreamPart):
+        (name,) = {"gravity", "mass_matrix", "coriolis"} & vector.keys()
+        assert answer.mean.shape == ((2, 2) if name == "mass_matrix" else (2,))
+        np.testing.assert_array_equal(answer.mean.ravel(), numbers(vector[name]))
+        assert (answer.std is not None) == ("gravity_std" in vector)
+        if answer.std is not None:
+            np.testing.assert_array_equal(answer.std, numbers(vector["gravity_std"]))
+        return
+    assert isinstance(answer, StreamAnswer)
     assert answer.fallback == bool(int(vector["flags"]) & 128)
     for name in ("tau", "tau_std", "scale"):
         assert (getattr(answer, name) is not None) == (name in vector)
@@ -92,7 +107,8 @@ def test_python_client_reads_answers(vector):
 @each("answer")
 def test_reader_of_the_tests_agrees(vector):
     answer = read(vector["bytes"])
-    np.testing.assert_array_equal(answer.tau, numbers(vector["tau"]))
+    name = next(name for name in ("tau", "gravity", "mass_matrix", "coriolis") if name in vector)
+    np.testing.assert_array_equal(np.ravel(getattr(answer, "tau" if name == "tau" else "part")), numbers(vector[name]))
     assert (answer.scale is not None) == ("scale" in vector)
 
 
@@ -137,7 +153,7 @@ def test_accepted_key_matches_a_websocket_library(vector):
 
 
 def test_vectors_contain_edge_cases():
-    values = np.concatenate([numbers(vector[name]) for vector in KINDS["request"] for name in ("q", "dq", "ddq")])
+    values = np.concatenate([numbers(vector[name]) for vector in KINDS["request"][:4] for name in ("q", "dq", "ddq")])
     assert any(math.copysign(1.0, value) < 0 and value == 0 for value in values)
     assert struct.unpack_from("<I", KINDS["request"][2]["bytes"])[0] == 2**32 - 1
 

@@ -9,7 +9,7 @@ import pytest
 import typer
 
 from lipserve import StreamClient, StreamError
-from lipserve.exchange import StreamAnswer, StreamRefusal
+from lipserve.answers import StreamAnswer, StreamRefusal
 from service.cli.playing import Tally, recorded, refused_figures
 from service.cli.simulate import app as simulating
 from service.cli.stream import app as streaming_app

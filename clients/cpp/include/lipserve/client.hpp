@@ -80,6 +80,9 @@ struct Deadline {
   }
 };
 
+/// What a query asks for: the torque, or a part of M(q) ddq + Coriolis torque + gravity.
+enum class Kind : std::uint8_t { torque = 0, gravity = 8, mass_matrix = 16, coriolis = 32 };
+
 /// One motion, with arrays of `joints` numbers: q, rad (prismatic: m); dq, rad/s (m/s); ddq, rad/s² (m/s²); optional
 /// measured torque tau, N·m (N).
 struct Query {
@@ -91,6 +94,7 @@ struct Query {
   bool external = false;  // request the external torque: the part of tau that the model does not explain
   bool learn = false;     // for `ask`: let the model learn from tau after the answer
   double budget = 0.0;    // max time in the service before it counts the answer as late, s; 0: none
+  Kind kind = Kind::torque;  // other kinds need q alone, or q and dq; tau, external and learn are then ignored
 };
 
 /// Answer of the service; torques in N·m (N). Arrays have `joints` numbers and are null if not requested. The client
@@ -106,6 +110,11 @@ struct Answer {
   const double* tau_std = nullptr;           // standard deviation of the predicted torque, without measurement noise
   /// Factor on the half width of intervals: 95 % of measurements are in tau ± 1.96 · scale · √(tau_std² + noise_std²).
   const double* scale = nullptr;
+  // answers to queries of another kind have these arrays alone
+  const double* gravity = nullptr;
+  const double* gravity_std = nullptr;
+  const double* mass_matrix = nullptr;       // joints × joints, row by row, kg·m²; with rotors, symmetric
+  const double* coriolis = nullptr;          // Coriolis and centrifugal torque
   const double* tau_external = nullptr;      // measured − predicted torque. Not a safety function
   const double* tau_external_std = nullptr;
   const double* tau_external_z = nullptr;
@@ -199,7 +208,7 @@ constexpr int layout = 1;
 constexpr std::size_t request_head = 16, answer_head = 32;
 constexpr unsigned ask_std = 1, ask_learn = 2, ask_external = 4;
 constexpr unsigned has_std = 1, late = 2, error = 4, unread = 8, has_scale = 16, has_external = 32, has_payload = 64;
-constexpr unsigned fallback = 128;
+constexpr unsigned fallback = 128, has_gravity = 256, has_mass_matrix = 512, has_coriolis = 1024;
 
 /// Write the low bytes of a number; return the end.
 inline std::uint8_t* put(std::uint8_t* out, std::uint64_t value, unsigned bytes) {
@@ -228,17 +237,26 @@ inline double get(const std::uint8_t* in) {
 
 constexpr std::size_t request_bytes(std::size_t joints, bool tau) { return request_head + (tau ? 4 : 3) * 8 * joints; }
 
-/// Max number of values of an answer: mean, std, scale, three arrays of external torque; statistic, p, payload's two.
-constexpr std::size_t answer_numbers(std::size_t joints) { return 6 * joints + 4; }
+/// Max number of values of an answer: mean, std, scale, three arrays of external torque; statistic, p, payload's two; or
+/// the mass matrix.
+constexpr std::size_t answer_numbers(std::size_t joints) {
+  return joints * joints > 6 * joints + 4 ? joints * joints : 6 * joints + 4;
+}
+
+/// Number of arrays of a request: the first of q, dq, ddq and tau.
+inline std::size_t vectors(const Query& query) {
+  if (query.kind != Kind::torque) return query.kind == Kind::coriolis ? 2 : 1;
+  return query.learn || query.external ? 4 : 3;
+}
 
 /// Write a request to a buffer of `request_bytes`; return its length.
 inline std::size_t write(std::uint8_t* out, std::uint32_t sequence, const Query& query, std::size_t joints) {
-  const bool tau = query.learn || query.external;
-  const unsigned flags =
-      (query.std ? ask_std : 0U) | (query.learn ? ask_learn : 0U) | (query.external ? ask_external : 0U);
+  unsigned flags = static_cast<unsigned>(query.kind);
+  if (query.std && (flags == 0 || query.kind == Kind::gravity)) flags |= ask_std;
+  if (query.kind == Kind::torque) flags |= (query.learn ? ask_learn : 0U) | (query.external ? ask_external : 0U);
   std::uint8_t* end = put(put(put(put(out, sequence, 4), flags, 2), joints, 2), query.budget);
   const double* const parts[] = {query.q, query.dq, query.ddq, query.tau};
-  for (std::size_t part = 0; part < (tau ? 4U : 3U); ++part)
+  for (std::size_t part = 0; part < vectors(query); ++part)
     for (std::size_t joint = 0; joint < joints; ++joint) end = put(end, parts[part][joint]);
   return static_cast<std::size_t>(end - out);
 }
@@ -248,10 +266,10 @@ inline std::size_t write(std::uint8_t* out, std::uint32_t sequence, const Query&
 inline bool read(const std::uint8_t* data, std::size_t size, std::size_t joints, double* numbers, Answer& answer) {
   if (size < answer_head) return false;
   const std::uint64_t flags = get(data + 4, 2);
-  const std::size_t arrays =
-      1U + (flags & has_std ? 1U : 0U) + (flags & has_scale ? 1U : 0U) + (flags & has_external ? 3U : 0U);
+  const std::size_t arrays = (flags & has_mass_matrix ? joints : 1U) + (flags & has_std ? 1U : 0U) +
+                             (flags & has_scale ? 1U : 0U) + (flags & has_external ? 3U : 0U);
   const std::size_t count = arrays * joints + (flags & has_external ? 2U : 0U) + (flags & has_payload ? 2U : 0U);
-  if (flags & error || get(data + 6, 2) != joints || size != answer_head + 8 * count) return false;
+  if (flags & error || count > answer_numbers(joints) || get(data + 6, 2) != joints || size != answer_head + 8 * count) return false;
   for (std::size_t k = 0; k < count; ++k) numbers[k] = get(data + answer_head + 8 * k);
   answer = Answer{};
   answer.sequence = static_cast<std::uint32_t>(get(data, 4));
@@ -262,8 +280,14 @@ inline bool read(const std::uint8_t* data, std::size_t size, std::size_t joints,
   answer.seconds = get(data + 24);
   const double* next = numbers;
   const auto take = [&next](std::size_t many) { return (next += many) - many; };
-  answer.tau = take(joints);
-  if (flags & has_std) answer.tau_std = take(joints);
+  if (flags & has_mass_matrix) {
+    answer.mass_matrix = take(joints * joints);
+  } else if (flags & has_coriolis) {
+    answer.coriolis = take(joints);
+  } else {
+    (flags & has_gravity ? answer.gravity : answer.tau) = take(joints);
+    if (flags & has_std) (flags & has_gravity ? answer.gravity_std : answer.tau_std) = take(joints);
+  }
   if (flags & has_scale) answer.scale = take(joints);
   if (flags & has_external) {
     answer.tau_external = take(joints);
@@ -764,6 +788,24 @@ class Client {
   /// that were kept before. In a control loop, call `ask` first, then `teach`.
   Status ask(const Query& query, Answer& answer, Deadline until);
 
+  /// Request a part of the torque as `ask` does. If no answer arrives by the deadline, `answer` has no arrays. `refused`
+  /// if the model has no such part.
+  Status gravity(const double* q, Answer& answer, Deadline until, bool std = true) {
+    Query query{q};
+    query.kind = Kind::gravity, query.std = std;
+    return ask(query, answer, until);
+  }
+  Status mass_matrix(const double* q, Answer& answer, Deadline until) {
+    Query query{q};
+    query.kind = Kind::mass_matrix;
+    return ask(query, answer, until);
+  }
+  Status coriolis(const double* q, const double* dq, Answer& answer, Deadline until) {
+    Query query{q, dq};
+    query.kind = Kind::coriolis;
+    return ask(query, answer, until);
+  }
+
   /// Let the model learn from the torque measured at a motion: keep it, and send it if possible without waiting. `ok`:
   /// it is kept.
   Status teach(const Query& query);
@@ -854,7 +896,7 @@ class Client {
   void take_error(const Flight& flight);
 
   // sending
-  bool check(const Query& query, bool tau);
+  bool check(const Query& query);
   bool keep(const Query& query);
   void fill();
   void send_frame(const std::uint8_t* frame, std::size_t size, Flight flight);
@@ -914,9 +956,10 @@ class Client {
   std::uint32_t asked_ = 0;     // sequence that `ask` waits for
   bool asking_ = false, ask_unsent_ = false, answered_ = false;
   Status outcome_ = Status::ok;
-  Answer answer_;
+  Kind kind_ = Kind::torque;  // of the query that `ask` waits for
+  Answer answer_, part_;      // last answers: a torque, and another kind
 
-  std::unique_ptr<double[]> numbers_, noise_std_;
+  std::unique_ptr<double[]> numbers_, part_numbers_, noise_std_;
   std::unique_ptr<char[][64]> names_;
   Hello hello_;
   Learnt learnt_;
@@ -1048,6 +1091,7 @@ inline bool Client::allocate(const Options& options) {
   const bool made = make(in_, in_size_) && make(out_, out_size_) && make(message_, message_size_) &&
                     make(frame_, frame_bytes_) && make(kept_, backlog_ * frame_bytes_) && make(taught_, backlog_) &&
                     make(flights_, 2 * window_) && make(numbers_, frames::answer_numbers(joints_)) &&
+                    make(part_numbers_, frames::answer_numbers(joints_)) &&
                     make(noise_std_, joints_) && make(names_, joints_);
   if (!made) return wrong("backlog", "too large for the memory", "fewer torques");
   inbox_.use(message_.get(), message_size_);
@@ -1066,8 +1110,10 @@ inline Status Client::connect(Deadline until) {
 
 inline Status Client::ask(const Query& query, Answer& answer, Deadline until) {
   answer = Answer{};
-  if (stage_ == Stage::broken || !check(query, query.learn || query.external)) return Status::invalid;
-  if (query.learn) {
+  if (stage_ == Stage::broken || !check(query)) return Status::invalid;
+  kind_ = query.kind;
+  const bool learns = query.learn && kind_ == Kind::torque;
+  if (learns) {
     asked_ = static_cast<std::uint32_t>(sequence_), frame_size_ = 0;
     if (!keep(query)) return error_.status;
   } else {
@@ -1075,18 +1121,20 @@ inline Status Client::ask(const Query& query, Answer& answer, Deadline until) {
     frame_size_ = frames::write(frame_.get(), asked_, query, joints_);
   }
   ++counters_.asked;
-  asking_ = true, ask_unsent_ = !query.learn, answered_ = false;
+  asking_ = true, ask_unsent_ = !learns, answered_ = false;
   Status status = run(until, false, [this] { return answered_; });
   if (answered_) {
     status = outcome_;
     if (status == Status::ok) {
-      answer_.late |= Deadline::now().ns > until.ns;  // this thread was scheduled too late
-      answer = answer_, ++counters_.answered;
+      answer = kind_ == Kind::torque ? answer_ : part_;
+      answer.late |= Deadline::now().ns > until.ns;  // this thread was scheduled too late
+      ++counters_.answered;
     }
   } else if (status == Status::timeout) {
     say(error_, status, "timeout", "no answer by the deadline");
     error_.sequence = asked_;
-    answer = answer_, answer.late = true;  // last received answer
+    if (kind_ == Kind::torque) answer = answer_;  // last received answer
+    answer.late = true;
   }
   asking_ = ask_unsent_ = answered_ = false;
   return status;
@@ -1094,8 +1142,8 @@ inline Status Client::ask(const Query& query, Answer& answer, Deadline until) {
 
 inline Status Client::teach(const Query& query) {
   Query taught = query;
-  taught.std = taught.external = false, taught.learn = true;
-  if (stage_ == Stage::broken || !check(taught, true)) return Status::invalid;
+  taught.std = taught.external = false, taught.learn = true, taught.kind = Kind::torque;
+  if (stage_ == Stage::broken || !check(taught)) return Status::invalid;
   if (!keep(taught)) return error_.status;
   tick();
   return Status::ok;
@@ -1117,9 +1165,13 @@ inline void Client::close() {
   retry_at_ = 0, backoff_ = 0;
 }
 
-inline bool Client::check(const Query& query, bool tau) {
-  if (!query.q || !query.dq || !query.ddq) return wrong("q, dq or ddq", "null", "one number per joint");
-  if (tau && !query.tau) return wrong("tau", "null", "the torque measured at this motion");
+inline bool Client::check(const Query& query) {
+  const double* const parts[] = {query.q, query.dq, query.ddq, query.tau};
+  const std::size_t vectors = frames::vectors(query);
+  for (std::size_t part = 0; part < (vectors < 3 ? vectors : 3); ++part)
+    if (!parts[part]) return wrong("q, dq or ddq", "null", "one number per joint");
+  if (query.kind != Kind::torque) return true;
+  if (vectors == 4 && !query.tau) return wrong("tau", "null", "the torque measured at this motion");
   if (query.learn && !learns_)
     return wrong("stream_id of the options", "null", "the name of the robot or recording, which learning requires");
   return true;
@@ -1438,7 +1490,9 @@ inline void Client::take_answer() {
     outcome_ = Status::refused;
   } else {
     // if nobody waits for the answer, only its header is read
-    if (awaited && !frames::read(inbox_.data, inbox_.size, joints_, numbers_.get(), answer_))
+    const bool torque = kind_ == Kind::torque;
+    double* const numbers = torque ? numbers_.get() : part_numbers_.get();
+    if (awaited && !frames::read(inbox_.data, inbox_.size, joints_, numbers, torque ? answer_ : part_))
       return fail("the service sent an answer whose length does not match its header");
     outcome_ = Status::ok;
   }

@@ -6,7 +6,10 @@ from websockets.exceptions import ConnectionClosedError
 
 from tests.service.data import DEADLINE
 from tests.service.streams import (
+    ASK_CORIOLIS,
     ASK_EXTERNAL,
+    ASK_GRAVITY,
+    ASK_MASS_MATRIX,
     ERROR,
     MOTION,
     TAU,
@@ -35,7 +38,16 @@ BAD = {
     "text": ("what is the torque?", "frame", "a text message", "a binary message"),
     "empty": (b"", "frame", "0 bytes long", "a header of 16 bytes"),
     "another robot": (frame(np.zeros((3, 7))), "n", "7", "2 joints: "),
-    "unknown flag": (frame(flags=8), "flags", "8", "a sum of 1 (return tau_std), 2 (learn from tau) and 4"),
+    "unknown flag": (frame(flags=64), "flags", "64", "a sum of 1 (return tau_std), 2 (learn from tau) and 4"),
+    "two parts": (
+        frame(MOTION[:2], flags=ASK_MASS_MATRIX | ASK_CORIOLIS),
+        "flags",
+        "48",
+        "a sum of 1 (return tau_std)",
+    ),
+    "gravity with dq": (frame(MOTION[:2], flags=ASK_GRAVITY), "frame", "48 bytes long", "32 bytes for 2 joints with q"),
+    "coriolis without dq": (frame(MOTION[:1], flags=ASK_CORIOLIS), "frame", "32 bytes long", "48 bytes for 2 joints"),
+    "no number": (frame([[np.nan, 0.0]], flags=ASK_MASS_MATRIX), "q[0]", "nan", "a finite number"),
     "learn, no torque": (frame(flags=2), "frame", "64 bytes long", "80 bytes for 2 joints with tau"),
     "external, no torque": (frame(flags=ASK_EXTERNAL), "frame", "64 bytes long", "80 bytes for 2 joints with tau"),
     "torque in vain": (frame(tau=TAU, learn=False), "frame", "80 bytes long", "64 bytes for 2 joints"),

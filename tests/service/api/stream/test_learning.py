@@ -275,7 +275,7 @@ async def test_acknowledgement_waits_for_the_answer_being_written():
 
 
 async def test_client_that_reads_no_acknowledgements_is_disconnected():
-    with patch("service.api.stream.session.PATIENCE", ClientPatience(frame_s=0.01)):
+    with patch("service.api.stream.conversation.PATIENCE", ClientPatience(frame_s=0.01)):
         async with SessionClient(stream_flush_rows=1) as client:
             client.learners.open.clear()
             await client.send_torques(1)

@@ -23,7 +23,7 @@ MiB = 1024 * 1024
 def bounded(tmp_path_factory):
     """A server with room for two streams that soon closes those that do not read."""
     home = tmp_path_factory.mktemp("bounded")
-    soon = {"service.api.stream.session.PATIENCE": ClientPatience(frame_s=1.0)}
+    soon = {"service.api.stream.conversation.PATIENCE": ClientPatience(frame_s=1.0)}
     with Server(home, warm=True, constants=soon, LIPSERVE_MAX_STREAMS="2") as started:
         yield started
 

@@ -10,7 +10,8 @@ import pytest
 
 from lipcore.model.prediction import Fallback, TorqueAnswer
 from service.api.errors import UNEXPECTED_ERROR
-from service.api.stream.session import Echo, Session
+from service.api.stream.conversation import Echo
+from service.api.stream.session import Session
 from service.foundation.settings import Settings
 from service.models.loads import StreamPayload, StreamPayloads
 from service.models.scales import Factor, Scales
