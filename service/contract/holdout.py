@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from lipcore.data.splits import Kind, Split
+from service.contract.body import RequestBody
 
 _DEFAULTS = Split()
 HoldoutKind = Literal["auto", "stretches", Kind]
@@ -16,10 +17,10 @@ Stretch = Annotated[list[Row], Field(min_length=2, max_length=2)]
 """Rows of a data set in order of episode and time: first, and last (exclusive)."""
 
 
-class Holdout(BaseModel):
+class Holdout(RequestBody):
     """Part of the data that is held out to evaluate a version: contiguous rows, not random ones."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"share": 0.3}]})
+    model_config = ConfigDict(json_schema_extra={"examples": [{"share": 0.3}]})
 
     kind: HoldoutKind = Field(
         "auto",

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.estimators.options import MAX_SEARCH_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, TORCH_ESTIMATORS, JointType
+from service.contract.body import RequestBody
 from service.contract.holdout import Holdout
 from service.contract.models import VERSION, ModelName
 from service.contract.states import JobState, PromotionOption
@@ -19,10 +20,8 @@ MAX_OPTIONS = {"hyperparameter_samples": 500, "posterior_samples": 1000, "max_in
 _DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
 
 
-class Options(BaseModel):
+class Options(RequestBody):
     """Options of the fit. The defaults suit most recordings."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
 
     hyperparameter_samples: int = Field(
         _DEFAULTS.hyperparameter_samples, ge=10, description="Samples for the fit of the hyperparameters"
@@ -81,12 +80,10 @@ class Options(BaseModel):
 DatasetName = Annotated[str, Field(max_length=MAX_NAME_CHARS)]
 
 
-class JobRequest(BaseModel):
+class JobRequest(RequestBody):
     """A model to train, its data sets and options."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
         json_schema_extra={"examples": [{"model": "my-panda", "datasets": ["ds_0123456789abcdef"]}]},
     )
 

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchem
 
 from lipcore.online.record import LEVEL
 from lipcore.vocabulary import CODES, ExportFormat
+from service.contract.body import RequestBody
 from service.contract.models import VersionNumber
 from service.contract.observations import MAX_SEQUENCE, LearningOptions, State
 from service.contract.verdict import Verdict
@@ -143,10 +144,10 @@ def _code(value: Any) -> str:
 ReplayCode = Annotated[str, PlainValidator(_code), WithJsonSchema({"type": "string", "enum": list(REPLAYABLE)})]
 
 
-class ReplayRequest(BaseModel):
+class ReplayRequest(RequestBody):
     """Rejected rows of a batch to be learnt after all."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"codes": ["contact"]}]})
+    model_config = ConfigDict(json_schema_extra={"examples": [{"codes": ["contact"]}]})
 
     codes: list[ReplayCode] | None = Field(
         None,
@@ -165,12 +166,10 @@ class Replayed(Revised):
     codes: dict[str, int] = Field(description="Learnt rows, by the code that rejected them")
 
 
-class RollbackRequest(BaseModel):
+class RollbackRequest(RequestBody):
     """Target of a rollback: a revision of the serving version, or another version."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, json_schema_extra={"examples": [{"revision": 120}, {"version": 1}]}
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [{"revision": 120}, {"version": 1}]})
 
     revision: int | None = Field(
         None,
@@ -272,12 +271,10 @@ class Learning(BaseModel):
     status: LearningStatus
 
 
-class ChangeRequest(BaseModel):
+class ChangeRequest(RequestBody):
     """Decision about a change that has paused learning."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, json_schema_extra={"examples": [{"decision": "adapt", "replay": True}]}
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [{"decision": "adapt", "replay": True}]})
 
     decision: Literal["adapt", "ignore"] = Field(
         description="`adapt`: the robot has changed, so earlier rows count less. `ignore`: resume learning as before"
@@ -310,7 +307,7 @@ class AlarmPage(BaseModel):
     next_cursor: str | None
 
 
-class RefreshRequest(BaseModel):
+class RefreshRequest(RequestBody):
     """Refresh of the serving version, with its estimator, options and robot. There are no fields."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{}]})
+    model_config = ConfigDict(json_schema_extra={"examples": [{}]})

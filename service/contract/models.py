@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, field_validator
 
 from lipcore.vocabulary import ComponentName, JointType, TorqueConvention
+from service.contract.body import RequestBody
 from service.contract.states import PromotionOption
 from service.contract.verdict import Thresholds, Verdict
 
@@ -177,12 +178,10 @@ class ModelPage(BaseModel):
     next_cursor: str | None
 
 
-class Annotation(BaseModel):
+class Annotation(RequestBody):
     """Note and tags of a version. Omitted fields stay; null or an empty value removes them."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, json_schema_extra={"examples": [{"note": "new gripper", "tags": ["line 2"]}]}
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [{"note": "new gripper", "tags": ["line 2"]}]})
 
     note: Note | None = Field(None, description="Text of at most 500 characters")
     tags: Tags | None = Field(None, description="At most 10 tags of at most 40 characters, without commas")
@@ -194,12 +193,10 @@ class Annotation(BaseModel):
         return (list(dict.fromkeys(value)) if isinstance(value, list) else value) or None
 
 
-class AliasRequest(BaseModel):
+class AliasRequest(RequestBody):
     """Target of an alias: a version, or the present target of another alias."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, json_schema_extra={"examples": [{"version": 2}, {"alias": "candidate"}]}
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [{"version": 2}, {"alias": "candidate"}]})
 
     version: VersionNumber | None = Field(None, description="A version of the model")
     alias: AliasName | None = Field(None, description="Another alias of the model, instead of a version")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
 from lipcore.data.outliers import MAX_TORQUE
+from service.contract.body import RequestBody
 from service.foundation.errors import ServiceError
 from service.foundation.fields import MAX_NAMES, list_of_numbers, rows_of_numbers
 
@@ -23,10 +24,10 @@ FRICTION_WALK_S = (10.0, 1e9)
 TorqueLimit = Annotated[float, Field(ge=TORQUE_LIMIT[0], le=TORQUE_LIMIT[1], allow_inf_nan=False)]
 
 
-class LearningOptions(BaseModel):
+class LearningOptions(RequestBody):
     """Options of online learning."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    model_config = ConfigDict(frozen=True)
 
     enabled: bool = Field(
         True, description="False pauses learning: rows are predicted, checked and logged, but not learnt"
@@ -101,13 +102,10 @@ Times = Annotated[
 """JSON array of shape (N,), or a number for one row."""
 
 
-class ObservationRequest(BaseModel):
+class ObservationRequest(RequestBody):
     """A batch of rows from one stream, in SI units. A row with null or a number that is not finite is not learnt."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
-        arbitrary_types_allowed=True,
         json_schema_extra={
             "examples": [
                 {

@@ -8,6 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSche
 from pydantic_core import PydanticCustomError
 
 from lipcore.vocabulary import PayloadState
+from service.contract.body import RequestBody
 from service.contract.observations import StreamId
 
 
@@ -35,10 +36,10 @@ Triples = Annotated[
 ]
 
 
-class Payload(BaseModel):
+class Payload(RequestBody):
     """A body on the last link, which the last joint moves, that was not there in training."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    model_config = ConfigDict(frozen=True)
 
     mass: Annotated[float, Field(gt=0, le=MAX_PAYLOAD_NUMBER, allow_inf_nan=False)] = Field(
         description="Mass, kg, above zero"
@@ -68,10 +69,10 @@ Row = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 PAYLOAD_EXAMPLE: dict[str, Any] = {"mass": 1.5, "com": [0.0, 0.0, 0.12]}
 
 
-class PayloadRequest(BaseModel):
+class PayloadRequest(RequestBody):
     """A payload in the frame of the last link, as in robot controllers."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [PAYLOAD_EXAMPLE]})
+    model_config = ConfigDict(json_schema_extra={"examples": [PAYLOAD_EXAMPLE]})
 
     mass: float = Field(gt=0, le=1000.0, allow_inf_nan=False, description="Mass, kg")
     com: Annotated[list[Metres], Field(min_length=3, max_length=3)] = Field(description="Centre of mass, m")

@@ -16,6 +16,7 @@ from pydantic import (
 )
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
+from service.contract.body import RequestBody
 from service.contract.holdout import Evaluation
 from service.contract.models import AliasName, VersionNumber
 from service.contract.payload import Payload
@@ -50,7 +51,7 @@ def one_choice(version: int | None, alias: str | None) -> None:
         raise invalid_request("alias", alias, "no alias beside a version", message)
 
 
-class VersionChoice(BaseModel):
+class VersionChoice(RequestBody):
     """Choice of a version: a number, an alias, or by default the serving version."""
 
     version: VersionNumber | None = Field(None, description="Version of the model; the serving version by default")
@@ -84,10 +85,8 @@ _EarlierRows = Annotated[
 ]
 
 
-class History(BaseModel):
+class History(RequestBody):
     """Motion before the first row of a query: at most 1000 rows in order of time."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True)
 
     t: _EarlierTimes = Field(description="Times, s, by the clock of the request's `t`: (N), rising")
     q: _EarlierRows = Field(description="Positions, rad (prismatic: m): (N, n)")
@@ -98,9 +97,6 @@ class PredictRequest(VersionChoice):
     """One query or a batch of queries, in SI units."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
-        arbitrary_types_allowed=True,
         json_schema_extra={
             "examples": [
                 {
@@ -198,38 +194,10 @@ class PredictResponse(BaseModel):
     )
 
 
-class GravityRequest(VersionChoice):
-    """Positions at which gravity is wanted, in SI units."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
-        arbitrary_types_allowed=True,
-        json_schema_extra={"examples": [{"q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7]}]},
-    )
-
-    q: Vectors = Field(description="Positions, rad (prismatic: m): (n) or (N, n)")
-    min_revision: MinRevision = None
-    payload: Payload | None = Field(None, description="Payload on the last link, as in `predict`")
-
-
-class GravityResponse(BaseModel):
-    """Torques that hold the arm against gravity, in the shape of the query, without friction and its offset."""
-
-    model: str
-    version: int
-    revision: int = Field(description="Online updates applied to the version")
-    joint_names: list[str]
-    mean: list[float] | list[list[float]] = Field(description="Mean, N·m (prismatic: N)")
-    std: list[float] | list[list[float]] = Field(description="Standard deviation of the function")
-
-
 class EvaluateRequest(VersionChoice):
     """Data set with which a model is compared."""
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]}
-    )
+    model_config = ConfigDict(json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]})
 
     dataset: str = Field(max_length=MAX_NAME_CHARS, description="Id or name of a data set")
     part: Part = Field(
@@ -268,8 +236,6 @@ class TraceRequest(EvaluateRequest):
     """Rows of a data set along which a model is traced."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
         json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "points": 500, "components": ["gravity"]}]},
     )
 
@@ -327,12 +293,10 @@ class TraceResponse(BaseModel):
     )
 
 
-class CompareRequest(BaseModel):
+class CompareRequest(RequestBody):
     """Two versions to compare on a data set."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
         json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "versions": ["production", 2]}]},
     )
 

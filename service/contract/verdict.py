@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.model.verdict import OPTIONS, JudgedOn, Level
+from service.contract.body import RequestBody
 
 LABELS: dict[Level, str] = {
     "wrong": "wrong",
@@ -16,10 +17,10 @@ LABELS: dict[Level, str] = {
 """Words for each level."""
 
 
-class Thresholds(BaseModel):
+class Thresholds(RequestBody):
     """Thresholds of the verdicts on the versions of a model."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"max_error": 0.25}]})
+    model_config = ConfigDict(json_schema_extra={"examples": [{"max_error": 0.25}]})
 
     max_error: float = Field(
         OPTIONS.max_error,

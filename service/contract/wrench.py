@@ -1,4 +1,4 @@
-"""External wrench: requests and answers."""
+"""Gravity and external wrench: requests and answers."""
 
 from __future__ import annotations
 
@@ -8,13 +8,33 @@ from service.contract.payload import Payload
 from service.contract.predictions import MinRevision, Vectors, VersionChoice
 
 
+class GravityRequest(VersionChoice):
+    """Positions at which gravity is wanted, in SI units."""
+
+    model_config = ConfigDict(
+        json_schema_extra={"examples": [{"q": [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7]}]},
+    )
+
+    q: Vectors = Field(description="Positions, rad (prismatic: m): (n) or (N, n)")
+    min_revision: MinRevision = None
+    payload: Payload | None = Field(None, description="Payload on the last link, as in `predict`")
+
+
+class GravityResponse(BaseModel):
+    """Torques that hold the arm against gravity, in the shape of the query, without friction and its offset."""
+
+    model: str
+    version: int
+    revision: int = Field(description="Online updates applied to the version")
+    joint_names: list[str]
+    mean: list[float] | list[list[float]] = Field(description="Mean, N·m (prismatic: N)")
+    std: list[float] | list[list[float]] = Field(description="Standard deviation of the function")
+
+
 class WrenchRequest(VersionChoice):
     """Motions and measured torques, in SI units."""
 
     model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
-        arbitrary_types_allowed=True,
         json_schema_extra={
             "examples": [
                 {

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from lipcore.model.equation import UnavailableComponentError
-from service.contract.predictions import GravityRequest, GravityResponse
+from service.contract.wrench import GravityRequest, GravityResponse
 from service.foundation.errors import invalid_request
 from service.inference.predicting import Query, check_answer, check_count, check_shapes, model_with_payload
 from service.models.loaded import LoadedModels, ServedModel

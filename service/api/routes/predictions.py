@@ -14,7 +14,7 @@ from service.api.dependencies import LoadedModelsDep, PredictionsDep
 from service.api.errors import responses
 from service.api.route import JSON, OCTETS, Reply, Route, hot_route, is_json, media_type
 from service.contract import predictions as schema
-from service.contract.wrench import WrenchRequest, WrenchResponse
+from service.contract.wrench import GravityRequest, GravityResponse, WrenchRequest, WrenchResponse
 from service.foundation.errors import (
     DamagedDataError,
     InvalidRequestError,
@@ -110,7 +110,7 @@ async def _in_thread(
 async def _revised(
     loaded: LoadedModels,
     model: str,
-    request: schema.PredictRequest | schema.GravityRequest | WrenchRequest | schema.EvaluateRequest,
+    request: schema.PredictRequest | GravityRequest | WrenchRequest | schema.EvaluateRequest,
 ) -> ServedModel | None:
     """Wait for the revision that a request asks for and return its version, None if it asks for none."""
     if request.min_revision is None:
@@ -145,8 +145,8 @@ hot.add_api_route(
 @router.post("/{model}/gravity", summary="Return the gravity torque", responses=_LATE)
 @needs(PREDICT)
 async def gravity(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.GravityRequest
-) -> schema.GravityResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: GravityRequest
+) -> GravityResponse:
     """Return the torque that holds the arm against gravity at one posture or a batch, with its standard deviation.
 
     It needs neither `dq` nor `ddq`. A torque without gravity is the component `without_gravity` of `predict`.

@@ -10,7 +10,7 @@ from lipcore import load
 from lipcore.data.motion import Motion
 from lipcore.model import dynamics
 from lipserve import ApiError
-from service.contract.predictions import GravityRequest
+from service.contract.wrench import GravityRequest
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
 from service.inference.gravity import gravity

@@ -34,6 +34,22 @@ from lipserve.results.series import (
 )
 
 
+def _query(
+    model: str,
+    version: int | None,
+    alias: str | None,
+    min_revision: int | None,
+    payload: Mapping[str, ArrayLike] | None,
+    **arrays: ArrayLike | None,
+) -> tuple[str, dict[str, Any]]:
+    """Return the name of a model and the body of a query. arrays: those that are not None are sent, as numbers."""
+    name, which = split_name(model, version, alias)
+    body = {key: np.asarray(each, dtype=np.float64).tolist() for key, each in arrays.items() if each is not None}
+    if payload is not None:
+        body["payload"] = {key: np.asarray(each).tolist() for key, each in payload.items()}
+    return name, body | which | given(min_revision=min_revision)
+
+
 @route("POST", "/v1/models/{model}/predict", repeatable=True)
 def predict(
     _route: Route,
@@ -82,19 +98,13 @@ def predict(
         >>> lower, upper = answer.interval(0.95)
         >>> rows = client.predict("panda-sim", q, dq, ddq, t=t, history=(t_before, q_before, dq_before))
     """
-    body: dict[str, Any] = {"covariance": covariance, "components": list(components)}
-    for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau), ("t", t)):
-        if values is not None:
-            body[name] = np.asarray(values, dtype=np.float64).tolist()
+    name, body = _query(model, version, alias, min_revision, payload, q=q, dq=dq, ddq=ddq, tau=tau, t=t)
+    body |= {"covariance": covariance, "components": list(components)}
     if t is not None and np.ndim(q) > 1:
         body["trajectory"] = True
     if history is not None:
         parts = zip(("t", "q", "dq"), history, (1, 2, 2), strict=True)
         body["history"] = {name: np.array(values, np.float64, ndmin=axes).tolist() for name, values, axes in parts}
-    if payload is not None:
-        body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
-    name, which = split_name(model, version, alias)
-    body |= which | given(min_revision=min_revision)
     return _route(read_prediction, names={"model": name}, json=body)
 
 
@@ -124,11 +134,7 @@ def gravity(
     Example:
         >>> client.gravity("panda-sim", [0.0] * 7).mean
     """
-    body: dict[str, Any] = {"q": np.asarray(q, dtype=np.float64).tolist()}
-    if payload is not None:
-        body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
-    name, which = split_name(model, version, alias)
-    body |= which | given(min_revision=min_revision)
+    name, body = _query(model, version, alias, min_revision, payload, q=q)
     return _route(read_component, names={"model": name}, json=body)
 
 
@@ -171,12 +177,7 @@ def wrench(
     Example:
         >>> client.wrench("my-ur10", q, dq, ddq, tau).base
     """
-    values = {"q": q, "dq": dq, "ddq": ddq, "tau": tau} | given(tool=tool)
-    body: dict[str, Any] = {name: np.asarray(each, dtype=np.float64).tolist() for name, each in values.items()}
-    if payload is not None:
-        body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
-    name, which = split_name(model, version, alias)
-    body |= which | given(min_revision=min_revision)
+    name, body = _query(model, version, alias, min_revision, payload, q=q, dq=dq, ddq=ddq, tau=tau, tool=tool)
     return _route(read_wrench, names={"model": name}, json=body)
 
 
