@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from lipserve import AsyncStreamClient, StreamError
+from lipserve import AsyncStreamClient, Client, StreamError
 from tests.clients.python.test_stream_client import answer, client_of, error, scripted
 from tests.service.data import DEADLINE
 from tests.service.streams import MOTION
@@ -21,8 +21,10 @@ def part(sequence, flags=256):
     return struct.pack("<IHHIIQdd", sequence, flags, 1, 3, 0, 4, 0.5, 10.0 * sequence)
 
 
-def test_parts_and_friction_sum_to_the_torque(streaming):
-    model = streaming.model
+def test_parts_are_the_components_that_http_returns(streaming):
+    names = ["gravity", "inertia_matrix", "coriolis"]
+    with Client(streaming.server.url) as client:
+        whole = client.predict("pendulum", Q, DQ, DDQ, components=names)
 
     async def ask():
         async with AsyncStreamClient("pendulum", streaming.server.url, timeout=DEADLINE) as client:
@@ -30,15 +32,14 @@ def test_parts_and_friction_sum_to_the_torque(streaming):
 
     with client_of(streaming) as client:
         found = [client.gravity(Q), client.mass_matrix(Q), client.coriolis(Q, DQ)]
-        bare, torque, rest = client.gravity(Q, std=False), client.predict(Q, DQ, DDQ), client.predict(Q, DQ, 0 * Q)
-    np.testing.assert_allclose(found[1].mean @ DDQ, torque.tau - rest.tau, rtol=1e-9, atol=1e-9)
-    expected = [model.gravity(Q).mean, model.mass_matrix(Q), model.coriolis(Q, DQ)]
+        bare, moving, rest = client.gravity(Q, std=False), client.predict(Q, DQ, DDQ), client.predict(Q, DQ, 0 * Q)
+    np.testing.assert_allclose(found[1].mean @ DDQ, moving.tau - rest.tau, rtol=1e-9, atol=1e-9)
     for seen in (found, asyncio.run(ask())):
         assert [each.sequence for each in seen] == [1, 2, 3]
-        for each, mean in zip(seen, expected, strict=True):
-            assert (each.version, each.revision, each.late) == (1, 0, False)
-            np.testing.assert_allclose(each.mean, mean, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(seen[0].std, model.gravity(Q).std, rtol=1e-9)
+        for each, name in zip(seen, names, strict=True):
+            assert (each.version, each.revision, each.late) == (1, whole.revision, False)
+            np.testing.assert_allclose(each.mean, whole.components[name].mean, rtol=1e-9, atol=1e-11)
+        np.testing.assert_allclose(seen[0].std, whole.components["gravity"].std, rtol=1e-6)
     assert bare.std is found[1].std is found[2].std is None
 
 
