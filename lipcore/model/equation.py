@@ -33,6 +33,10 @@ AFFINE_ESTIMATORS = (*ENERGY_ESTIMATORS, "gip")
 """Estimators whose torque is affine in ddq."""
 
 
+VELOCITY, ACCELERATION = 1, 2
+"""Rows of `Motion.arrays`."""
+
+
 class UnavailableComponentError(ValueError):
     """The component does not exist, or the model does not have it. expected: models that have it."""
 
@@ -59,9 +63,10 @@ def gravity(model: TorqueModel, q: Array) -> Estimate:
 def coriolis(model: TorqueModel, q: Array, dq: Array) -> Array:
     """Return the Coriolis torque at N states, (N, n); see `TorqueModel.coriolis`."""
     _check_energies(model, "the Coriolis torque")
-    rest = np.zeros_like(q)
-    moving = with_fixed_deflections(model.estimator, Motion(q, dq, rest))
-    torques = _torques(model, [moving, replace(moving, dq=rest)])
+    moving = with_fixed_deflections(model.estimator, Motion(q, dq, np.zeros_like(q))).arrays()
+    motions = np.stack([moving, moving])
+    motions[1, :, VELOCITY] = 0.0
+    torques = _torques(model, motions)
     return np.asarray(torques[0] - torques[1])
 
 
@@ -73,10 +78,11 @@ def mass_matrix(model: TorqueModel, q: Array) -> Array:
             "the acceleration.",
             f"a model of estimator {', '.join(AFFINE_ESTIMATORS)}",
         )
-    rest = np.zeros_like(q)
-    still = with_fixed_deflections(model.estimator, Motion(q, rest, rest))
-    pushes = [replace(still, ddq=rest + unit) for unit in np.eye(model.n_joints)]
-    torques = _torques(model, [still, *pushes])
+    rest, joints = np.zeros_like(q), np.arange(model.n_joints)
+    still = with_fixed_deflections(model.estimator, Motion(q, rest, rest)).arrays()
+    motions = np.stack([still] * (model.n_joints + 1))
+    motions[joints + 1, :, ACCELERATION, joints] = 1.0
+    torques = _torques(model, motions)
     columns = torques[1:] - torques[0]  # (n, N, n)
     return np.asarray(0.5 * (columns.transpose(1, 2, 0) + columns.transpose(1, 0, 2)))
 
@@ -142,13 +148,13 @@ def with_fixed_deflections(estimator: Estimator, motion: Motion) -> Motion:
     return replace(motion, deflections=known)
 
 
-def _torques(model: TorqueModel, motions: list[Motion]) -> Array:
-    """Return the mean torques without friction and correction of S motions of N instants, (S, N, n)."""
-    stacked, bodies = np.concatenate([each.arrays() for each in motions]), model.linear_bodies
+def _torques(model: TorqueModel, motions: Array) -> Array:
+    """Return the mean torques without friction and correction, (S, N, n). motions: (S, N, …) as `Motion.arrays`."""
+    flat, bodies = motions.reshape(-1, *motions.shape[2:]), model.linear_bodies
     if bodies is not None:
-        found = bodies.torques(stacked)
+        found = bodies.torques(flat)
     else:
-        found = model.posterior.mean(Motion.of(stacked), _bodies(model.estimator))
+        found = model.posterior.mean(Motion.of(flat), _bodies(model.estimator))
     return found.reshape(len(motions), -1, model.n_joints)
 
 
