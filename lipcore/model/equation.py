@@ -17,7 +17,8 @@ import numpy as np
 
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import Estimator
-from lipcore.kernels.base import LinearKernel, SumKernel, TorqueKernel
+from lipcore.kernels.base import LinearKernel, TorqueKernel
+from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import deflections_of
 from lipcore.kernels.mixture import MixtureKernel
