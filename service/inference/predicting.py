@@ -26,6 +26,8 @@ from service.models.loaded import LoadedModels, ServedModel
 Array = NDArray[np.float64]
 MAX_BATCH, MAX_COMPONENT_BATCH = 1000, 100
 """Maximum queries of one prediction request, and of one with components."""
+MAX_BINARY_BATCH = 100_000
+"""Maximum queries of an inference request whose tensors are binary. The size of its body limits it, too."""
 MAX_HISTORY = 1000
 """Maximum rows of the motion before a query."""
 QUANTITIES = ("q", "dq", "ddq", "tau")

@@ -51,7 +51,7 @@ def body_limits(settings: Settings) -> dict[str, int]:
         "/v1/datasets": settings.max_upload_bytes,
         "/v1/robots": MAX_URDF_BYTES,
         "/v1/models/import": MAX_ARCHIVE_BYTES,
-        **dict.fromkeys(("predict", "observations", "infer", "echo"), settings.max_request_bytes),
+        **dict.fromkeys(("predict", "observations", "infer", "ModelInfer", "echo"), settings.max_request_bytes),
         "*": min(256 * 1024, settings.max_request_bytes),  # a list of a thousand long names
     }
 

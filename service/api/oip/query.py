@@ -21,7 +21,15 @@ from service.api.oip.tensors import Answer, Header, Message
 from service.api.route import Reply
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
-from service.inference.predicting import FORWARD, QUANTITIES, Query, check_answer, check_count, check_torque
+from service.inference.predicting import (
+    FORWARD,
+    MAX_BINARY_BATCH,
+    QUANTITIES,
+    Query,
+    check_answer,
+    check_count,
+    check_torque,
+)
 from service.inference.wrench import wrenches
 from service.models.loaded import ServedModel
 
@@ -44,9 +52,12 @@ WRENCH_OUTPUTS = {
 """Outputs with six numbers per query, of models with the geometry of a URDF, and the property of `Wrench`."""
 FALLBACK = "fallback"
 """Output with the share of the fallback in `tau`."""
-_MEAN = "mean"
-"""Posterior mean that external torque is computed from. It is not an output."""
-INLINE_OUTPUTS = MODEL_OUTPUTS | EXTERNAL_OUTPUTS.keys() | {"tau", "tau_std", FALLBACK}
+MEAN = "tau_mean"
+"""Output with the posterior mean, which never falls back. External torque is computed from it."""
+TORQUE_OUTPUTS = frozenset({"tau", "tau_std", FALLBACK, MEAN})
+LARGE_BATCH_OUTPUTS = MODEL_OUTPUTS | TORQUE_OUTPUTS
+"""Outputs of binary batches with more than `MAX_BATCH` queries."""
+INLINE_OUTPUTS = LARGE_BATCH_OUTPUTS | EXTERNAL_OUTPUTS.keys()
 """Outputs that are computed on the event loop for a single query."""
 _STD = "_std"
 _TORQUES = ("gravity", "coriolis", "inertial", "friction", "without_gravity")
@@ -72,7 +83,8 @@ OUTPUTS_NEEDING_TORQUE |= EXTERNAL_OUTPUTS.keys() | WRENCH_OUTPUTS.keys()
 def shapes(model: TorqueModel) -> dict[str, Shape]:
     """Return the shape of every output of a model for N queries; -1 stands for N."""
     n, offered = model.n_joints, offered_components(model.estimator.name)
-    tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n), FALLBACK: (-1, n)}
+    tensors: dict[str, Shape] = dict.fromkeys(("tau", "tau_std", MEAN, FALLBACK), (-1, n))
+    tensors["covariance"] = (-1, n, n)
     tensors |= dict.fromkeys(sorted(MODEL_OUTPUTS), (n,))
     tensors |= {name: (-1, 1) if name in ARM_OUTPUTS else (-1, n) for name in EXTERNAL_OUTPUTS}
     if has_wrench(model):
@@ -116,7 +128,8 @@ def read(message: Message, model: TorqueModel, settings: Settings) -> InferTask:
     outputs = _outputs(request, model)
     tensors = _inputs(request, bool(OUTPUTS_NEEDING_TORQUE & outputs.keys()))
     shape = request.inputs[0].shape
-    _check_shape(request.inputs[0], shape, model, bool(COMPONENT_TENSORS.keys() & outputs.keys()))
+    may_be_large = outputs.keys() <= LARGE_BATCH_OUTPUTS and message.is_binary(outputs.values())
+    _check_shape(request.inputs[0], shape, model, bool(COMPONENT_TENSORS.keys() & outputs.keys()), may_be_large)
     message.check()
     single, rows = len(shape) == 1, 1 if len(shape) == 1 else shape[0]
     values = np.empty((len(tensors), rows, model.n_joints))
@@ -180,12 +193,16 @@ def _inputs(request: schema.InferRequest, torque: bool) -> tuple[str, ...]:
     return needed
 
 
-def _check_shape(tensor: schema.InferInput, shape: list[int], model: TorqueModel, components: bool) -> None:
+def _check_shape(
+    tensor: schema.InferInput, shape: list[int], model: TorqueModel, components: bool, may_be_large: bool
+) -> None:
     n, field = model.n_joints, f"{tensor.name}.shape"
     if len(shape) not in (1, 2) or shape[-1] != n or shape[0] == 0:
         joints = ", ".join(model.joint_names)
         raise invalid_request(field, shape, f"[{n}] for one query or [N, {n}] for a batch: the joints are {joints}")
-    if len(shape) == 2:
+    if may_be_large and shape[0] > MAX_BINARY_BATCH and len(shape) == 2:
+        raise invalid_request(field, shape, f"at most {MAX_BINARY_BATCH} queries in one request")
+    if not may_be_large and len(shape) == 2:
         check_count(field, shape, shape[0], components, " queries")
 
 
@@ -222,7 +239,7 @@ def compute(served: ServedModel, task: InferTask) -> dict[str, Array]:
         tensors |= {"noise_std": model.noise_std, "scale": scale}
     if compared:
         between = tensors["covariance"] if of_arm else None
-        seen = external(query.values[3], tensors[_MEAN], tensors["tau_std"], model.noise_std, scale, between)
+        seen = external(query.values[3], tensors[MEAN], tensors["tau_std"], model.noise_std, scale, between)
         tensors |= {name: _rows(getattr(seen, EXTERNAL_OUTPUTS[name])) for name in compared}
     tensors |= _wrenches(model, task, scale, names & WRENCH_OUTPUTS.keys())
     parts = {name: COMPONENT_TENSORS[name] for name in names if name in COMPONENT_TENSORS}
@@ -249,24 +266,22 @@ def _rows(values: Array) -> Array:
 
 
 def _torques(model: TorqueModel, motion: Array, deflections: Array | None, names: frozenset[str]) -> dict[str, Array]:
-    """Return the named torque tensors and `_MEAN`; `motion` holds q, dq and ddq, (3, N, n)."""
+    """Return the named torque tensors; `motion` holds q, dq and ddq, (3, N, n)."""
     wide, rows = "covariance" in names, motion.shape[1]
-    if deflections is not None:
-        motion = np.concatenate([motion, deflections.swapaxes(0, 1)])
-    if not wide and names.isdisjoint({"tau_std", FALLBACK}):
-        if "tau" not in names:
-            return {}
-        # the mean of one query costs less than its share of a batch, which includes standard deviations
-        each = np.ascontiguousarray(motion.transpose(1, 0, 2))
-        return {"tau": np.stack([model.answer(one, std=False)[0] for one in each])}
+    names = names & (TORQUE_OUTPUTS | {"covariance"})
+    if not names:
+        return {}
+    if names == {MEAN} and rows > 1:
+        return {MEAN: model.torque(motion[0], motion[1], motion[2], deflections)}
     answer: TorqueAnswer | TorquePrediction
     if rows == 1:
-        answer = model.answer_fully(motion[:, 0], covariance=wide)
+        known = motion[:, 0] if deflections is None else np.concatenate([motion[:, 0], deflections[0]])
+        answer = model.answer_fully(known, covariance=wide)
     else:
         answer = model.predict(motion[0], motion[1], motion[2], wide, deflections)
     share = np.zeros_like(answer.tau) if answer.fallback is None else answer.fallback.share
     tensors = {"tau": answer.tau, "tau_std": answer.tau_std, "covariance": answer.covariance}
-    tensors |= {FALLBACK: share, _MEAN: answer.mean}
+    tensors |= {FALLBACK: share, MEAN: answer.mean}
     return {name: each[None] if rows == 1 else each for name, each in tensors.items() if each is not None}
 
 

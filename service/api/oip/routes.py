@@ -118,6 +118,11 @@ async def infer(request: Request) -> Response:
     Queries with the same `sequence_id` are one motion, in order of arrival. Friction that depends on earlier motion
     follows it. The motion before a new `sequence_id`, `sequence_start` or a pause of 0.25 s is unknown.
 
+    A batch has at most 1000 queries. With binary inputs and outputs, of which each is `tau`, `tau_std`, `tau_mean`,
+    `fallback`, `noise_std` or `scale`, it has at most 100 000, if the body is not too large.
+
+    `tau_mean` is the posterior mean, which never falls back. Alone, it is the fastest output of a large batch.
+
     The 95 % interval of measurements is `tau` ± 1.96 · `scale` · √(`tau_std`² + `noise_std`²), see `PredictResponse`.
 
     External torque needs the measured torque as input `tau`. It is not a safety function. Its outputs are:

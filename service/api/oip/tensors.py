@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -33,6 +34,9 @@ class Message(Protocol):
     @property
     def request(self) -> InferRequest:
         """The request without the numbers."""
+
+    def is_binary(self, outputs: Iterable[bool]) -> bool:
+        """Return whether all tensors are bytes, those of the answer too. outputs: whether each is requested so."""
 
     def check(self) -> None:
         """Check that the numbers are where the request says; raise InvalidRequestError."""

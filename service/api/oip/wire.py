@@ -55,6 +55,11 @@ class Message:
     def __init__(self, request: InferRequest, body: bytes, offset: int) -> None:
         self.request, self._body, self._offset = request, body, offset
 
+    def is_binary(self, outputs: Iterable[bool]) -> bool:
+        """Return whether all inputs follow the JSON, and all outputs are requested in binary."""
+        sent = (each.parameters is not None and each.parameters.binary_data_size for each in self.request.inputs)
+        return all(sent) and all(outputs)
+
     def check(self) -> None:
         """Raise InvalidRequestError unless as many bytes follow the JSON as the inputs announce."""
         sizes = (each.parameters.binary_data_size or 0 for each in self.request.inputs if each.parameters)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import prod
 from typing import Any
 
@@ -52,6 +53,10 @@ class Message:
             or None,
             parameters=_parameters(sent.parameters),
         )
+
+    def is_binary(self, outputs: Iterable[bool]) -> bool:
+        """Return whether the numbers are raw: then those of the answer are, too."""
+        return self._raw
 
     def check(self) -> None:
         """Check that the numbers are all raw or all typed; raise InvalidRequestError."""

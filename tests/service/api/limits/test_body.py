@@ -6,7 +6,8 @@ from unittest.mock import AsyncMock
 import pytest
 from starlette.exceptions import HTTPException
 
-from service.api.limits.requests import BodyLimit
+from service.api.limits.requests import BodyLimit, body_limit, body_limits
+from service.foundation.settings import Settings
 
 SOON = 0.05
 """The time limit of a body, in seconds, in tests that exceed it."""
@@ -141,3 +142,10 @@ async def test_concurrent_bodies_of_a_client_are_limited():
     sent.set()
     await asyncio.gather(*waiting)
     await middleware(scope(), client_sending(b"x"), None)
+
+
+@pytest.mark.parametrize("path", ["/v2/models/arm/infer", "/inference.GRPCInferenceService/ModelInfer"])
+def test_inference_has_the_limit_of_the_settings_on_every_transport(path):
+    settings = Settings(max_request_bytes=5_000_000)
+    assert body_limit(body_limits(settings), path) == 5_000_000
+    assert body_limit(body_limits(settings), "/v1/models") < 5_000_000

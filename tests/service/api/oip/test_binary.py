@@ -16,7 +16,7 @@ from tests.service.api.oip.requests import HEADER, error_message, infer, infer_b
 Q, DQ, DDQ = [0.3, -0.7], [1.1, 0.2], [-2.0, 0.9]
 MOTION = {"q": Q, "dq": DQ, "ddq": DDQ}
 BATCH = {name: np.linspace(values[0], values[1], 6).reshape(3, 2) for name, values in MOTION.items()}
-NAMES = ("tau", "tau_std", "noise_std", "covariance", "tau_friction", "inertia_matrix", "kinetic_energy")
+NAMES = ("tau", "tau_std", "noise_std", "covariance", "tau_mean", "tau_friction", "inertia_matrix", "kinetic_energy")
 
 
 def request(motion, datatype="FP64", **more):
@@ -99,6 +99,24 @@ def test_binary_and_json_agree_bit_for_bit(api, trained, both):
     assert list(tensors) == list(expected)
     for name, values in expected.items():
         assert_array_equal(tensors[name], values, err_msg=name)
+
+
+def test_large_batch_is_binary(api, trained):
+    motion = {name: np.linspace(values[0], values[1], 2400).reshape(1200, 2) for name, values in MOTION.items()}
+    expected = trained.model.predict(**motion)
+    wanted = request(motion, parameters={"binary_data_output": True})
+    for names in (["tau_mean"], ["tau", "tau_std", "tau_mean"]):
+        wanted["outputs"] = [{"name": name} for name in names]
+        _, tensors = oip.binary_tensors(infer_binary(api, trained.name, wanted, payload(motion)))
+        assert list(tensors) == names
+        for name, values in tensors.items():
+            assert_array_equal(values, getattr(expected, name.removeprefix("tau_") if name == "tau_mean" else name))
+    for changes in ({"parameters": {}}, {"outputs": [{"name": "tau"}, {"name": "covariance"}]}):
+        reply = error_message(infer_binary(api, trained.name, wanted | changes, payload(motion)))
+        assert reply == "q.shape is [1200, 2], expected at most 1000 queries in one request"
+    huge = {name: np.broadcast_to(0.0, (100_001, 2)) for name in MOTION}
+    reply = error_message(infer_binary(api, trained.name, wanted | request(huge), b""))
+    assert reply == "q.shape is [100001, 2], expected at most 100000 queries in one request"
 
 
 @given(st.integers(0, len(TEXT + DATA) - 1))

@@ -10,7 +10,7 @@ from tests.service.data import service_of
 EACH = {"tau": [2], "kinetic_energy": [1], "potential_energy": [1], "forward_dynamics": [2], "inertia_matrix": [2, 2]}
 EACH |= {f"tau_{part}": [2] for part in ("coriolis", "gravity", "inertial", "friction", "without_gravity")}
 ENERGETIC = {name + end: [-1, *shape] for name, shape in EACH.items() for end in ("", "_std")}
-ENERGETIC |= {"noise_std": [2], "scale": [2], "covariance": [-1, 2, 2], "fallback": [-1, 2]}
+ENERGETIC |= {"noise_std": [2], "scale": [2], "covariance": [-1, 2, 2], "fallback": [-1, 2], "tau_mean": [-1, 2]}
 ENERGETIC |= {f"tau_external{end}": [-1, 2] for end in ("", "_std", "_z")}
 ENERGETIC |= {f"tau_external_{end}": [-1, 1] for end in ("statistic", "p")}
 """Tensors of a model of two joints whose estimator has energies."""
