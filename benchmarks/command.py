@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks import batch as batches
+from benchmarks.batch.command import batch
 from benchmarks.clients import BadAnswerError
 from benchmarks.exported import running as exported_running
 from benchmarks.ingest import running as ingest_running
@@ -86,7 +86,7 @@ def latency(
     report(table.grids(results), results.notes, found, console, markdown, strict)
 
 
-for _command in (online, durability, load, soak):
+for _command in (online, durability, load, soak, batch):
     app.command()(_command)
 
 
@@ -160,21 +160,6 @@ def exported(
     if json_file is not None:
         results.write(json_file, targets_json(found))
     report(exported_running.grids(results), [], found, console, markdown, strict)
-
-
-@app.command()
-def batch(
-    folder: Annotated[
-        Path, typer.Option(exists=True, file_okay=False, help="Folder of a saved model.")
-    ] = exported_running.SHIPPED,
-    sizes: Annotated[str, typer.Option(help="States in a batch, separated by commas.")] = "1,100,10000,100000",
-    repetitions: Annotated[int, typer.Option(min=1, help="Repetitions; the best counts.")] = 10,
-    markdown: Markdown = None,
-) -> None:
-    """Time large batches in process, beside Pinocchio in a Python loop."""
-    console = begin()
-    results = batches.run(folder, [int(each) for each in sizes.split(",")], repetitions, console)
-    report(batches.grids(results), [], [], console, markdown, False)
 
 
 @app.command()

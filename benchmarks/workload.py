@@ -104,12 +104,16 @@ class Bed:
 
 
 @contextmanager
-def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
-    """Start a service in an empty `home` with the model, trained by a job or copied; load the model here too."""
+def open_bed(home: Path, source: Source, console: Console, settings: Mapping[str, str] | None = None) -> Iterator[Bed]:
+    """Start a service in an empty `home` with the model, trained by a job or copied; load the model here too.
+
+    settings: further environment variables of the service.
+    """
     if source.folder is not None:
         _install(home, source.folder)
     unix = home / "lipserve.sock"
     env = {"LIPSERVE_HOME": str(home), "LIPSERVE_UDS": str(unix), "LIPSERVE_LOG_LEVEL": "warning"}
+    env |= settings or {}
     calls = ("127.0.0.1", free_port()) if find_spec("grpc") is not None else None
     if calls is not None:
         env["LIPSERVE_GRPC_PORT"] = str(calls[1])

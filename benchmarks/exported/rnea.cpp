@@ -1,4 +1,5 @@
 // Times Pinocchio's recursive Newton–Euler: `rnea MODEL CALLS QUERIES TIMES`, with the files of timing.c.
+// As a library, it computes batches.
 #include <pinocchio/fwd.hpp>
 
 #include <pinocchio/algorithm/rnea.hpp>
@@ -11,6 +12,30 @@
 #include <fstream>
 #include <iterator>
 #include <vector>
+
+struct Robot
+{
+    pinocchio::Model model;
+    pinocchio::Data data;
+};
+
+extern "C" Robot *read_robot(const char *path)
+{
+    pinocchio::Model model;
+    model.loadFromText(path);
+    return new Robot{model, pinocchio::Data(model)};
+}
+
+extern "C" void rnea_batch(Robot *robot, long count, const double *motions, double *tau)
+{
+    using Vector = Eigen::Map<const Eigen::VectorXd>;
+    const long nq = robot->model.nq, nv = robot->model.nv;
+    for (long k = 0; k < count; k++) {
+        const double *at = motions + k * (nq + 2 * nv);
+        const Vector q(at, nq), v(at + nq, nv), a(at + nq + nv, nv);
+        Eigen::Map<Eigen::VectorXd>(tau + k * nv, nv) = pinocchio::rnea(robot->model, robot->data, q, v, a);
+    }
+}
 
 int main(int count, char **given)
 {

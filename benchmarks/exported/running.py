@@ -79,13 +79,13 @@ def run(options: Options, console: Console) -> Results:
             (folder / name).write_text(text)
         motion.tofile(folder / "queries")
         command = ["cc", "-std=c99", *options.flags, f"-I{folder}", str(HERE / "timing.c"), str(folder / SOURCE)]
-        _do([*command, "-o", str(folder / "timing"), "-lm"], folder)
-        _do(["cc", "-std=c99", *options.flags, "-c", SOURCE, "-o", "model.o"], folder)
+        run_command([*command, "-o", str(folder / "timing"), "-lm"], folder)
+        run_command(["cc", "-std=c99", *options.flags, "-c", SOURCE, "-o", "model.o"], folder)
         results.sizes = {path.name: path.stat().st_size for path in sorted(folder.glob("*model.*"))}
         calls = str(options.calls)
         for subject in ("nothing", *(("state", "state_std") if model.remembers else ()), "mean", "std"):
             console.print(f"{subject}: {options.calls:,} calls", highlight=False)
-            _do([str(folder / "timing"), subject, calls, "queries", "times", "answers"], folder)
+            run_command([str(folder / "timing"), subject, calls, "queries", "times", "answers"], folder)
             results.timings[subject] = Timing.of(np.fromfile(folder / "times", np.int64))
         answers = np.fromfile(folder / "answers").reshape(-1, 2, model.n_joints)
         robot = simulator(options.folder)
@@ -146,18 +146,24 @@ def _motion(limits: TrainingRange, options: Options) -> Array:
 
 
 def _time_cpp(robot: Robot, options: Options, motion: Array, folder: Path) -> Timing:
-    prefix = Path(str(pinocchio().__file__)).parents[4]  # cmeel.prefix, with the wheel's headers
-    robot.model.saveToText(str(folder / "robot"))
+    assert options.eigen is not None
+    compile_pinocchio(robot, options.eigen, ("-O2",), folder)
     np.array([np.concatenate([robot.configuration(q), dq, ddq]) for q, dq, ddq in motion]).tofile(folder / "motions")
-    defined = [f"-D{each}" for each in (*PINOCCHIO, "PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION")]
-    command = ["c++", "-std=c++17", "-O2", *defined, f"-I{options.eigen}", f"-I{prefix / 'include'}"]
-    libraries = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-lpinocchio_default", "-lboost_serialization"]
-    _do([*command, str(HERE / "rnea.cpp"), *libraries, "-o", "rnea"], folder)
-    _do([str(folder / "rnea"), "robot", str(options.calls), "motions", "times"], folder)
+    run_command([str(folder / "rnea"), "robot", str(options.calls), "motions", "times"], folder)
     return Timing.of(np.fromfile(folder / "times", np.int64))
 
 
-def _do(command: Sequence[str], folder: Path) -> None:
+def compile_pinocchio(robot: Robot, eigen: Path, flags: Sequence[str], folder: Path) -> None:
+    """Write `rnea`, a program, or a library if `flags` say so, and `robot`, its model; raise BenchError."""
+    prefix = Path(str(pinocchio().__file__)).parents[4]  # cmeel.prefix, with the wheel's headers
+    robot.model.saveToText(str(folder / "robot"))
+    defined = [f"-D{each}" for each in (*PINOCCHIO, "PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION")]
+    command = ["c++", "-std=c++17", *flags, *defined, f"-I{eigen}", f"-I{prefix / 'include'}"]
+    libraries = [f"-L{prefix / 'lib'}", f"-Wl,-rpath,{prefix / 'lib'}", "-lpinocchio_default", "-lboost_serialization"]
+    run_command([*command, str(HERE / "rnea.cpp"), *libraries, "-o", "rnea"], folder)
+
+
+def run_command(command: Sequence[str], folder: Path) -> None:
     """Run a command; raise BenchError with its error output if it fails."""
     try:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - ours
