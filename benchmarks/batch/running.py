@@ -83,7 +83,7 @@ def run(options: Options, console: Console) -> Results:
                 count = min(size, peer.max_states or size)
                 _measure(results, options, peer.name, size, count, peer.prepare(batch[:, :count].copy()))
             if options.device is not None:
-                for name, work in on_device(model, options.device, batch):
+                for name, work in on_device(model, options.device, batch, options.device != "cpu"):
                     _measure(results, options, name, size, size, work)
         results.deviations = _deviations(model, peers, states[:, :COMPARED])
     return results

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
-from benchmarks.batch import running, transports
+from benchmarks.batch import on_device, running, transports
 from benchmarks.batch.peers import open_peers
 from benchmarks.batch.running import Options, draw_states
 from benchmarks.batch.symbolic import rnea_function
@@ -33,6 +34,22 @@ def test_times_of_all_subjects_and_sizes(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def _fail(*_: object) -> None:
     raise BenchError("no compiler")
+
+
+@pytest.mark.slow  # traces thousands of operations
+def test_compiled_chunks_on_a_device_equal_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(on_device, "CHUNK", 20)
+    monkeypatch.setattr(on_device, "DTYPES", {"float64": torch.float64})
+    monkeypatch.setattr(torch, "compile", lambda traced, dynamic: traced)
+    model = load(SHIPPED)
+    states = draw_states(model, 40)
+    expected = model.predict(*states)
+    found = {name: work() for name, work in on_device.on_device(model, "cpu", states, compiles=True)}
+    assert list(found) == [f"{kind}, cpu float64{how}" for kind in ("mean", "with std") for how in ("", ", compiled")]
+    for name, chunks in found.items():
+        parts = list(zip(*chunks, strict=True)) if name.startswith("with std") else [chunks]
+        for part, known in zip(parts, (expected.mean, expected.tau_std), strict=False):
+            np.testing.assert_allclose(np.concatenate(part), known, rtol=0, atol=1e-9 * np.abs(known).max())
 
 
 @pytest.mark.parametrize("name", ["panda", "ur10", "tiago", "double-pendulum"])
