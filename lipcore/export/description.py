@@ -37,12 +37,15 @@ def _gravity_comments(geometry: Geometry) -> list[str]:
     return []
 
 
-def joint_comments(arm: SimulatedArm, k: int, sheet: Sheet | None) -> list[str]:
-    """Return the comments of a joint: terms left out, parameters that torque does not determine, torque errors."""
+def joint_comments(arm: SimulatedArm, k: int, sheet: Sheet | None, offset: str = "is left out") -> list[str]:
+    """Return the comments of a joint: terms left out, parameters that torque does not determine, torque errors.
+
+    offset: what became of the constant torque.
+    """
     joints = arm.joints
     terms = {"damping": joints.viscous[k], "friction": joints.coulomb[k], "rotor": joints.rotor[k]}
     notes = [f"learnt {key} is {value_text(value)}, written as 0" for key, value in terms.items() if value < 0]
-    notes.append(f"offset torque {value_text(joints.offset[k])} is left out")
+    notes.append(f"offset torque {value_text(joints.offset[k])} {offset}")
     if joints.undetermined and joints.undetermined[k]:
         notes.append(f"not identifiable from torque: {', '.join(joints.undetermined[k])}")
     return notes if sheet is None else [*notes, sheet.joint_note(k)]

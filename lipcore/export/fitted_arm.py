@@ -46,7 +46,7 @@ def fit_arm(model: TorqueModel, arm: SimulatedArm) -> SimulatedArm:
     """Return the arm with bodies, rotors, viscous and Coulomb friction fitted to the model's torque.
 
     arm: the model's, from `SimulatedArm.of_parameters`. The learnt constant torque of each joint, `offset`, is
-    subtracted before, because simulators leave it out. Errors are relative to each joint's torque. Parameters that
+    subtracted before: no joint of a simulator has one. Errors are relative to each joint's torque. Parameters that
     torque does not determine stay near those of `arm`. Of the geometries of `arm`, of the learnt bodies, and of the
     linearisation, the one with the smallest error is used. Raise ValueError for a model without rigid bodies.
     """

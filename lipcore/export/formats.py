@@ -48,7 +48,7 @@ def _write_urdf(model: TorqueModel, parameters: Mapping[str, Any], origin: Model
 
 def _write_mjcf(model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin) -> dict[str, bytes]:
     arm = _arm(model, parameters)
-    return {f"{origin.stem}.xml": mjcf_text(arm, origin.stem, Sheet.of(model, arm, origin)).encode()}
+    return {f"{origin.stem}.xml": mjcf_text(arm, origin.stem, Sheet.of(model, arm, origin, has_offset=True)).encode()}
 
 
 def _write_c(model: TorqueModel, parameters: Mapping[str, Any], origin: ModelOrigin) -> dict[str, bytes]:

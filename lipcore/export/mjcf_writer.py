@@ -1,9 +1,9 @@
 """An MJCF of an arm for MuJoCo: one body a joint, with mass, rotor (armature), viscous and Coulomb friction.
 
 `mj_inverse` plus Coulomb friction is the arm's torque if the option flag `frictionloss` is disabled. MuJoCo's own
-Coulomb friction is a constraint, whose force depends on the acceleration, too. Terms that a joint of MuJoCo cannot
-express are left out; comments have their largest torque. If gravity does not point down the base's z axis, the body
-`base` is turned.
+Coulomb friction is a constraint, whose force depends on the acceleration, too. The offset of the torque is a bias of
+the motor. Terms that a joint of MuJoCo cannot express are left out; comments have their largest torque. If gravity does
+not point down the base's z axis, the body `base` is turned.
 """
 
 from __future__ import annotations
@@ -32,10 +32,15 @@ from lipcore.kernels.geometry import rotation_vector_of
 from lipcore.model.plausible import nearest_solid
 
 COMMENTS = (
-    "One motor a joint: its control is the torque, N·m (N). Geometry is drawn, it collides with nothing.",
+    "One motor a joint: its control is the torque, N·m (N). Its bias is minus the learnt offset of the torque.",
+    "Geometry is drawn, it collides with nothing.",
     "Self-test: numbers selftest_q, _dq, _ddq, _tau, _model_tau, state by state. With the option flag frictionloss "
-    "disabled, mj_inverse plus frictionloss · sign(dq) is selftest_tau; the torque of the model is selftest_model_tau.",
+    "disabled, mj_inverse plus frictionloss · sign(dq) minus the motor's bias is selftest_tau; the torque of the model "
+    "is selftest_model_tau.",
 )
+FRICTION_IMPEDANCE = "0.9999 0.9999 0.001"
+"""Impedance of friction: MuJoCo's maximum. With the default, 0.9, friction grows with speed: at the last joint of a
+Panda up to 0.3 rad/s, and a joint at rest slips."""
 LEAST_SPREAD = 1e-12
 """Min second moment of a body about its centre of mass, kg·m². MuJoCo rejects moments of inertia below 1e-15."""
 
@@ -65,10 +70,11 @@ def mjcf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
         body = ElementTree.SubElement(body, "body", name=f"{joint}_link", pos=place, quat=turn)
         _inertial(body, arm.bodies[k])
         _joint(body, arm, k)
-        add_comments(body, joint_comments(arm, k, sheet))
+        add_comments(body, joint_comments(arm, k, sheet, "is in the motor"))
     actuators = ElementTree.SubElement(root, "actuator")
-    for joint in joints.names:
-        ElementTree.SubElement(actuators, "motor", name=f"{joint}_motor", joint=joint)
+    for joint, offset in zip(joints.names, joints.offset, strict=True):
+        motor = ElementTree.SubElement(actuators, "general", name=f"{joint}_motor", joint=joint)
+        motor.attrib |= {"biastype": "affine", "biasprm": f"{value_text(-offset)} 0 0"}
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -100,6 +106,8 @@ def _joint(body: Element, arm: SimulatedArm, k: int) -> None:
     values = {key: value_text(max(value, 0.0)) for key, value in terms.items()}
     if joints.lower[k] < joints.upper[k]:  # MuJoCo rejects a range of zero
         values["range"] = join_values(np.array([joints.lower[k], joints.upper[k]]))
+    if joints.coulomb[k] > 0:
+        values["solimpfriction"] = FRICTION_IMPEDANCE
     axis = join_values(arm.geometry.axis[k])
     ElementTree.SubElement(body, "joint", {"name": joints.names[k], "type": kind, "axis": axis, **values})
 

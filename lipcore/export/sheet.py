@@ -42,10 +42,10 @@ class Sheet:
     """States q, dq, ddq; the torque `tau` of the file, with sign(dq) as Coulomb sign; `model_tau` of the model."""
 
     @classmethod
-    def of(cls, model: TorqueModel, arm: SimulatedArm, origin: ModelOrigin) -> Sheet:
-        """Return the facts about the arm of a model."""
+    def of(cls, model: TorqueModel, arm: SimulatedArm, origin: ModelOrigin, *, has_offset: bool = False) -> Sheet:
+        """Return the facts about the arm of a model. has_offset: whether its motors have the learnt offset."""
         order, names = arm.order, arm.joints.names
-        errors = torque_shortfall(model, arm)
+        errors = torque_shortfall(model, arm, has_offset=has_offset)
         about = describe_model(model, origin, [int(joint) for joint in order]) | {
             "max_error": {
                 name: {term: float(f"{error[joint]:.3g}") for term, error in errors.items() if error[joint]}
@@ -54,7 +54,7 @@ class Sheet:
         }
         motions = draw_states(model)
         q, dq, ddq = motions.swapaxes(0, 1)
-        tau = arm.bodies_torque(motions) + arm.friction_torque(dq, np.sign(dq))
+        tau = arm.bodies_torque(motions) + arm.friction_torque(dq, np.sign(dq)) + has_offset * arm.offset_torque()
         columns = {"q": q, "dq": dq, "ddq": ddq, "tau": tau, "model_tau": model.predict(q, dq, ddq).tau}
         return cls(about, {name: _rounded(values[:, order]) for name, values in columns.items()})
 

@@ -20,10 +20,10 @@ CURVE = ("stribeck", "speed", "sides")
 """Kinds of friction that are a curve of speed, which a simulator replaces by a line."""
 
 
-def torque_shortfall(model: TorqueModel, arm: SimulatedArm) -> dict[str, Array]:
+def torque_shortfall(model: TorqueModel, arm: SimulatedArm, *, has_offset: bool = False) -> dict[str, Array]:
     """Return the largest torque error of an arm in a simulator, by term, (n,) N·m (N), in the order of the data.
 
-    - `offset`: the constant torque.
+    - `offset`: the constant torque; zero if the simulator's motors have it (`has_offset`).
     - `friction curve`: friction as a function of speed minus viscous and Coulomb friction (Stribeck, cubic).
     - `position`, `load`, `gain`, `play`: as in `lipcore.kernels.drive.terms`. For `play`, a bound: an element that
       has just turned back differs from one that slips by twice its torque.
@@ -42,8 +42,7 @@ def torque_shortfall(model: TorqueModel, arm: SimulatedArm) -> dict[str, Array]:
     motion, n = Motion.of(motions), model.n_joints
     weights = weight_posterior(model.posterior, drive).mean.reshape(n, -1)
     each = dict(zip(drive.drive.terms, np.moveaxis(drive.drive.by_joint(motions) * weights, 2, 0), strict=True))
-    offset = np.zeros(n)
-    offset[arm.order] = arm.joints.offset
+    offset = arm.offset_torque()
     friction = arm.friction_torque(motion.dq, np.tanh(motion.dq / SIGN_WIDTH))
     curve = sum(each[term] for term in (*BASE_TERMS, *_terms(CURVE, drive))) - offset - friction
     slipped = weights[:, [name.startswith("play_") for name in drive.drive.terms]]
@@ -52,7 +51,8 @@ def torque_shortfall(model: TorqueModel, arm: SimulatedArm) -> dict[str, Array]:
     learnt = body.features(motion) @ weight_posterior(model.posterior, body).mean
     tau = model.predict(motion.q, motion.dq, motion.ddq).tau
     bodies = arm.bodies_torque(motions)
-    errors = {"offset": offset[None], "friction curve": curve}
+    expressed = has_offset * offset
+    errors = {"offset": (offset - expressed)[None], "friction curve": curve}
     errors |= {
         kind: np.sum([each[term] for term in _terms((kind,), drive)], axis=0)
         for kind in ("position", "load", "gain")
@@ -60,7 +60,7 @@ def torque_shortfall(model: TorqueModel, arm: SimulatedArm) -> dict[str, Array]:
     }
     errors["play"] = 2 * np.abs(slipped).sum(axis=1)[None]
     errors["correction"] = tau - learnt - np.sum(list(each.values()), axis=0)
-    errors |= {"bodies": learnt - bodies, "all": tau - bodies - friction}
+    errors |= {"bodies": learnt - bodies, "all": tau - bodies - friction - expressed}
     largest = {name: np.abs(error).max(axis=0) for name, error in errors.items()}
     return {name: np.where(error > NEGLIGIBLE * model.scale, error, 0.0) for name, error in largest.items()}
 

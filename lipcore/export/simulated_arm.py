@@ -125,6 +125,12 @@ class SimulatedArm:
         coulomb[self.order] = np.maximum(self.joints.coulomb, 0.0)
         return np.asarray(viscous * dq + coulomb * sign)
 
+    def offset_torque(self) -> Array:
+        """Return the learnt constant torque, (n,) N·m (N), in the order of the data."""
+        offset = np.zeros(len(self.order))
+        offset[self.order] = self.joints.offset
+        return offset
+
 
 def inertia_at_centre(body: Array) -> tuple[Array, Array]:
     """Return the centre of mass (3,) m of ten parameters, and the inertia about it, (3, 3) kg·m²."""

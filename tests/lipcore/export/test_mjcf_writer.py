@@ -27,7 +27,14 @@ from tests.lipcore.robots.test_urdf import joints, torque_of_urdf, training_rang
 
 mujoco = pytest.importorskip("mujoco", reason="needs the module mujoco, of the extra test")
 
-from benchmarks.studies.mujoco_rollout import follow, invert, relative_error  # noqa: E402 - imports mujoco
+from benchmarks.studies.mujoco_rollout import (  # noqa: E402 - imports mujoco
+    follow,
+    invert,
+    motor_offset,
+    open_arm,
+    place_joints,
+    relative_error,
+)
 
 LINE = ("viscous", "coulomb")
 ORIGIN = ModelOrigin("an-arm", 3, 7, "0123")
@@ -67,13 +74,13 @@ def test_mujoco_computes_the_torque_of_the_urdf(name: str) -> None:
     names = list(arm.joints.names)
     motions = np.random.default_rng(1).normal(0, 1.5, (1000, 3, len(names)))
     expected = torque_of_urdf(urdf_text(arm), names, motions, bool(arm.geometry.gravity.any()))
-    found = invert(mjcf_text(arm), tuple(names), motions)
+    found = invert(mjcf_text(arm), tuple(names), motions) - arm.joints.offset
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
 def test_file_has_origin_and_self_test() -> None:
     model = load(PANDA)
-    sheet = Sheet.of(model, arm_of(model), ORIGIN)
+    sheet = Sheet.of(model, arm_of(model), ORIGIN, has_offset=True)
     arm = mujoco.MjModel.from_xml_string(mjcf_text(arm_of(model), "an-arm-v3", sheet))
     about = json.loads(bytes(arm.text_data).rstrip(b"\0"))
     expected = {"model": "an-arm", "version": 3, "revision": 7, "sha256": "0123", "joints": list(model.joint_names)}
@@ -94,7 +101,7 @@ def test_file_has_origin_and_self_test() -> None:
 def test_joints_have_friction_rotor_range_and_motor() -> None:
     numbers = np.arange(3.0)
     given = joints(["a", "b", "<c>"], lower=-numbers, upper=numbers, viscous=0.1 - 0.2 * numbers, rotor=0.1 * numbers)
-    given = replace(given, coulomb=0.3 * numbers)
+    given = replace(given, coulomb=0.3 * numbers, offset=numbers - 1.0)
     bodies = random_bodies(3, 3)
     text = mjcf_text(SimulatedArm(random_geometry("RPR", 3), bodies, given, np.arange(3)), 'my "arm"')
     arm = mujoco.MjModel.from_xml_string(text)
@@ -105,7 +112,8 @@ def test_joints_have_friction_rotor_range_and_motor() -> None:
     np.testing.assert_allclose(arm.jnt_range[1:], [[-1, 1], [-2, 2]])
     assert arm.jnt_limited.tolist() == [0, 1, 1]  # the first joint has not moved
     np.testing.assert_allclose(arm.body_mass[2:], bodies[:, 0])
-    assert arm.nu == 3
+    np.testing.assert_allclose(arm.actuator_biasprm[:, 0], [1.0, 0.0, -1.0])
+    np.testing.assert_allclose(arm.actuator_biasprm[:, 1:], 0.0)
     assert "learnt damping is -0.3" in text
 
 
@@ -132,6 +140,40 @@ def test_bodies_that_mujoco_rejects_are_moved_to_the_nearest() -> None:
         assert distance(other) > distance(solid) or not is_plausible(other)
 
 
+def drift(mjcf: str, names: tuple[str, ...], share: float) -> np.ndarray:
+    """Return how far joints move within a second if friction has to hold a share of its maximum, (n,) rad."""
+    arm = open_arm(mjcf, len(names))
+    data, place = mujoco.MjData(arm), place_joints(arm, names)
+    for _ in range(round(1.0 / arm.opt.timestep)):
+        mujoco.mj_forward(arm, data)
+        data.qfrc_applied[:] = data.qfrc_bias + share * arm.dof_frictionloss
+        mujoco.mj_step(arm, data)
+    return np.abs(data.qpos[place])
+
+
+def test_friction_holds_joints_at_rest() -> None:
+    arm = arm_of(load(PANDA))
+    arm = replace(arm, joints=replace(arm.joints, coulomb=np.full(7, 0.3)))
+    mjcf, names = mjcf_text(arm), arm.joints.names
+    assert (drift(mjcf, names, 0.9) < 1e-3).all()
+    assert (drift(mjcf, names, 1.5) > 1e-2).all()
+    soft = mjcf.replace("solimpfriction", "solimplimit")  # MuJoCo's default
+    assert drift(soft, names, 0.9).max() > 0.05
+
+
+def test_control_is_torque_with_offset() -> None:
+    """At rest without friction, the control that balances gravity is gravity plus the offset."""
+    arm = replace(arm_of_kinds("RRR"), notes=())
+    arm = replace(arm, joints=replace(arm.joints, coulomb=np.zeros(3), offset=np.array([0.5, -0.2, 1.0])))
+    compiled = mujoco.MjModel.from_xml_string(mjcf_text(arm))
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    data.ctrl[:] = data.qfrc_bias + arm.joints.offset
+    mujoco.mj_forward(compiled, data)
+    np.testing.assert_allclose(data.qacc, 0.0, atol=1e-9)
+    np.testing.assert_allclose(motor_offset(compiled), arm.joints.offset)
+
+
 DRIVES = {
     "slow joints": lambda: with_drive(train_arm("RRR", 50), "stribeck", "play"),
     "all kinds": MODELS["friction of all kinds"],
@@ -155,6 +197,10 @@ def test_stated_errors_are_those_of_the_file(name: str) -> None:
     torque += np.maximum(found["coulomb"]["mean"], 0.0) * (np.tanh(dq / SIGN_WIDTH) - np.sign(dq))
     off = np.abs(model.predict(q, dq, ddq).tau - torque).max(axis=0)
     np.testing.assert_allclose(stated("all"), off, rtol=0.01)
+    with_offset = Sheet.of(model, arm, ORIGIN, has_offset=True).about["max_error"]
+    assert not any("offset" in terms for terms in with_offset.values())
+    off = np.abs(model.predict(q, dq, ddq).tau - torque - np.array(found["offset"]["mean"])).max(axis=0)
+    np.testing.assert_allclose([with_offset[joint]["all"] for joint in model.joint_names], off, rtol=0.01)
     if name == "slow joints":
         curve = [
             np.array(found[term]["mean"]) * feature - np.maximum(found[term]["mean"], 0.0) * feature * (term in LINE)
@@ -172,6 +218,6 @@ def test_arm_that_follows_a_motion_needs_the_recorded_torque() -> None:
     t = np.arange(1001) / 100.0
     q, dq, ddq = sinusoids(robot, simulation, t, np.random.default_rng(7))
     recorded = inverse_dynamics(robot, q, dq, ddq)
-    found = follow(mjcf_text(arm_of(model)), model.joint_names, t, q)
+    found = follow(mjcf_text(arm_of(model)), model.joint_names, t, np.stack([q, dq, ddq], axis=1))
     error = relative_error(found[20:], recorded[20:])  # the controller settles within 0.2 s
     assert (error < 0.05).all()
