@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from benchmarks.real.rivals import Forecast
+from benchmarks.real.rivals import Forecast, Intervals
 from benchmarks.real.splits import Split
 from benchmarks.workload import BenchError
 from lipcore.data.metrics import LEVEL, evaluate, quantile
@@ -57,6 +57,7 @@ class Result(BaseModel):
         width: mean half width of that interval / (1.96 × RMSE).
         seconds: time of training, for other methods with prediction, s.
         estimator: the estimator that LIPServe chose.
+        intervals: number of parameters with intervals, and of infinite ones; None without intervals of parameters.
     """
 
     model_config = ConfigDict(ser_json_inf_nan="constants")
@@ -72,6 +73,7 @@ class Result(BaseModel):
     width: list[float]
     seconds: float
     estimator: str = ""
+    intervals: Intervals | None = None
 
     @property
     def error(self) -> float:
@@ -105,6 +107,7 @@ def evaluate_forecast(cell: Cell, split: Split, forecast: Forecast, seconds: flo
         width=(figures.width / (2 * quantile(LEVEL) * figures.rmse)).tolist(),
         seconds=seconds,
         estimator=estimator,
+        intervals=forecast.intervals,
     )
 
 

@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.real.rivals import Forecast
+from benchmarks.real.peers import Peer
+from benchmarks.real.rivals import Forecast, Intervals
+from benchmarks.real.splits import thinned
 from lipcore.data.samples import Array, Samples
 from lipcore.robots.urdf import RigidBody
 
@@ -33,7 +35,7 @@ def predict_figaroh(body: RigidBody, train: Samples, test: Samples) -> Forecast:
     from figaroh.tools import qrdecomposition as qr  # noqa: PLC0415 - as above
     from figaroh.tools import regressor  # noqa: PLC0415 - as above
 
-    rows = train.rows(np.linspace(0, len(train) - 1, min(len(train), MAX_ROWS)).round().astype(np.int64))
+    rows = thinned(train, MAX_ROWS)
     chain, robot = np.argsort(body.order), SimpleNamespace(model=body.model, data=body.model.createData())
     config: dict[str, Any] = CONFIG | {"act_idxv": list(range(body.n_joints))}
 
@@ -53,4 +55,14 @@ def predict_figaroh(body: RigidBody, train: Samples, test: Samples) -> Forecast:
     mean, std = np.empty_like(test.tau), np.empty(body.n_joints)
     mean[:, chain] = (asked @ weights).reshape(body.n_joints, -1).T
     std[chain] = np.sqrt(np.square(tau - base @ weights).reshape(body.n_joints, -1).mean(axis=1))
-    return Forecast(mean, np.broadcast_to(std, mean.shape))
+    spread = tools.relative_stdev(base, weights, tau)
+    return Forecast(mean, np.broadcast_to(std, mean.shape), Intervals(len(weights), int(np.sum(~np.isfinite(spread)))))
+
+
+PEER = Peer(
+    needs="URDF, accelerations, joint order; units are those of the URDF",
+    friction="viscous, Coulomb",
+    parameters="standard deviations of base parameters, which are sums of masses and inertias",
+    torque="none",
+    code=(predict_figaroh,),
+)

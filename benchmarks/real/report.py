@@ -11,7 +11,7 @@ from benchmarks.latency import table
 from benchmarks.latency.table import NOTHING, Grid
 from benchmarks.latency.targets import Target
 from benchmarks.real.cells import OWN, PRODUCT, Knowledge, Result
-from benchmarks.real.running import ALONE, WITH_BODY, Outcome
+from benchmarks.real.running import ALONE, PEERS, WITH_BODY, Outcome
 from benchmarks.real.splits import EARLY, GUARD_S, MAX_TEST_ROWS, SECONDS
 
 TEN_S = 9.4
@@ -105,7 +105,13 @@ def _median(values: Sequence[float]) -> float | None:
 def grids(outcome: Outcome) -> list[Grid]:
     """Return all tables, the targets last."""
     summary = Summary(outcome.results)
-    found = [errors(summary), details(summary), methods(summary), table.targets_grid(targets(outcome.results), "")]
+    found = [
+        errors(summary),
+        details(summary),
+        methods(summary),
+        peers(summary),
+        table.targets_grid(targets(outcome.results), ""),
+    ]
     return [grid for grid in found if grid.rows]
 
 
@@ -163,6 +169,24 @@ def methods(summary: Summary) -> Grid:
         )
     heads = ("method", "joints covered 85 to 100 %, %", "median width / need", "median s", "max s", "smallest error")
     return Grid("intervals, times, and number of splits with the smallest error", heads, rows)
+
+
+def peers(summary: Summary) -> Grid:
+    """Return what each method needs to be told, what its user writes, and the uncertainty that it states."""
+    rows = []
+    for method, peer in PEERS.items():
+        results = [row[method, "URDF"] for row in summary.rows.values() if (method, "URDF") in row]
+        if not results:
+            continue
+        stated = [each.intervals for each in results if each.intervals is not None]
+        infinite = NOTHING
+        if stated:
+            infinite = f"{sum(each.infinite for each in stated)} of {sum(each.parameters for each in stated)}"
+        rows.append((method, peer.needs, peer.friction, str(peer.lines), peer.parameters, infinite, peer.torque))
+    heads = ("method", "needs", "friction", "lines of code", "parameters", "infinite", "torque")
+    return Grid(
+        "what a method needs besides q, dq and torque, and the uncertainty that it states", heads, rows, texts=True
+    )
 
 
 def notes(outcome: Outcome) -> list[str]:

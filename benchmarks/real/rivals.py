@@ -27,11 +27,20 @@ RIDGES = tuple(10.0**power for power in range(-8, 1))
 EM_STEPS = 30
 
 
+class Intervals(NamedTuple):
+    """Number of parameters that a method states intervals for, and of those that are infinite."""
+
+    parameters: int
+    infinite: int
+
+
 class Forecast(NamedTuple):
     """A prediction of N measured torques: mean and standard deviation of a measurement, (N, n) each, N·m."""
 
     mean: Array
     std: Array
+    intervals: Intervals | None = None
+    """Intervals of parameters, if the method has any."""
 
 
 Predict = Callable[[Samples, Samples], Forecast]

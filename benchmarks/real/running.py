@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from benchmarks.real import figaroh_fit, mujoco_sysid, rivals
+from benchmarks.real import figaroh_fit, mujoco_forward, mujoco_sysid, product, rivals
 from benchmarks.real.cells import BASE_FRICTION, PRODUCT, Cache, Cell, Result, evaluate_forecast
+from benchmarks.real.peers import Peer
 from benchmarks.real.product import Bed, open_bed
 from benchmarks.real.recordings import RECORDINGS, Recording, prepare
 from benchmarks.real.rivals import Forecast, Predict
@@ -34,11 +35,24 @@ WITH_BODY: Mapping[str, Callable[[RigidBody, Samples, Samples], Forecast]] = {
     "least squares": rivals.predict_least_squares,
     "Bayesian least squares": rivals.predict_bayesian,
     "mujoco.sysid": mujoco_sysid.predict_mujoco,
+    "mujoco.sysid, forward": mujoco_forward.predict_forward,
     "FIGAROH": figaroh_fit.predict_figaroh,
 }
 """Other methods that know the URDF."""
-OPTIONAL = {"mujoco.sysid": mujoco_sysid.is_installed, "FIGAROH": figaroh_fit.is_installed}
+OPTIONAL = {
+    "mujoco.sysid": mujoco_sysid.is_installed,
+    "mujoco.sysid, forward": mujoco_sysid.is_installed,
+    "FIGAROH": figaroh_fit.is_installed,
+}
 """Methods that may not be installed, and functions that check it."""
+
+PEERS: Mapping[str, Peer] = {
+    PRODUCT: product.PEER,
+    "FIGAROH": figaroh_fit.PEER,
+    "mujoco.sysid": mujoco_sysid.PEER,
+    "mujoco.sysid, forward": mujoco_forward.PEER,
+}
+"""Facts about LIPServe and about methods of others."""
 
 Service = Callable[[], Bed]
 """A function that returns the service and starts it on the first call."""

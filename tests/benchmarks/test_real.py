@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.real import figaroh_fit, mujoco_sysid, report, rivals, running
+from benchmarks.real import figaroh_fit, mujoco_forward, mujoco_sysid, report, rivals, running
 from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, evaluate_forecast
+from benchmarks.real.peers import count_lines
 from benchmarks.real.product import open_bed
 from benchmarks.real.recordings import Recording
 from benchmarks.real.rivals import Forecast
@@ -94,14 +95,29 @@ def test_the_mujoco_model_has_the_torque_of_the_urdf(name):
 @needs_mujoco
 def test_mujoco_finds_the_torque_of_a_simulated_robot():
     train, test = simulated(noise=0.001, samples=100), simulated(seed=2)
-    assert nmse(mujoco_sysid.predict_mujoco(PENDULUM.body(train), train, test), test).max() < 1e-2
+    forecast = mujoco_sysid.predict_mujoco(PENDULUM.body(train), train, test)
+    assert nmse(forecast, test).max() < 1e-2
+    assert forecast.intervals.parameters == 28
+    assert forecast.intervals.infinite > 14  # torque determines fewer combinations than masses and inertias
+
+
+@needs_mujoco
+@pytest.mark.slow
+def test_mujoco_finds_the_torque_from_simulated_motion(monkeypatch):
+    monkeypatch.setattr(mujoco_forward, "MAX_WINDOWS", 10)
+    train, test = simulated(noise=0.001), simulated(seed=2)
+    forecast = mujoco_forward.predict_forward(PENDULUM.body(train), train, test)
+    assert nmse(forecast, test).max() < 1e-2
 
 
 @pytest.mark.skipif(not figaroh_fit.is_installed(), reason="FIGAROH is not installed")
 @pytest.mark.filterwarnings("ignore:to-Python converter:RuntimeWarning")
 def test_figaroh_finds_the_torque_of_a_simulated_robot():
     train, test = simulated(noise=0.001, samples=100), simulated(seed=2)
-    assert nmse(figaroh_fit.predict_figaroh(PENDULUM.body(train), train, test), test).max() < 1e-2
+    forecast = figaroh_fit.predict_figaroh(PENDULUM.body(train), train, test)
+    assert nmse(forecast, test).max() < 1e-2
+    assert forecast.intervals.infinite == 0
+    assert forecast.intervals.parameters < 20  # of 28
 
 
 def test_splits_keep_a_guard_between_training_and_test():
@@ -247,6 +263,35 @@ def test_page_contains_every_table():
     )
     assert [part for part in parts if part not in page] == []
     assert "NOT met" not in page
+
+
+def test_peers_are_those_with_results():
+    known = {"knowledge": "URDF", "split": "other"}
+    results = [toy("a", method=PRODUCT, **known), toy("a", method="least squares", **known)]
+    results += [toy(name, method="mujoco.sysid", intervals=(10, 7), **known) for name in "ab"]
+    rows = {row[0]: row for row in report.peers(report.Summary(results)).rows}
+    assert list(rows) == [PRODUCT, "mujoco.sysid"]
+    assert rows["mujoco.sysid"][5] == "14 of 20"
+    assert rows[PRODUCT][5] == "–"
+    assert report.peers(report.Summary([toy()])).rows == []
+
+
+def test_lines_of_code_exclude_documentation():
+    source = '''
+    def double(value):
+        """Return twice a value.
+
+        It is a number.
+        """
+        # a comment
+
+        text = """of
+        two lines"""
+        return (
+            2 * value  # another
+        )
+    '''
+    assert count_lines(source) == 6
 
 
 @pytest.mark.slow
