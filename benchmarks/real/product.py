@@ -114,9 +114,9 @@ def open_bed(jobs: int) -> Iterator[Bed]:
 
 
 PEER = Peer(
-    needs="nothing; joint types and a URDF improve it",
+    needs="types of joints that slide; a URDF helps",
     friction="viscous, Coulomb, and by evidence of speed, load, position and play",
-    parameters="standard deviations; names unidentifiable ones",
+    parameters="standard deviations, all finite; unidentifiable ones are named",
     torque="95 % interval of each",
     code=(Bed.train, Bed.predict),
 )

@@ -198,6 +198,9 @@ def notes(outcome: Outcome) -> list[str]:
         "Width / need: mean half width of the 95 % interval over 1.96 RMSE. Worst joint / mean: largest error of a "
         "joint over the error of the training samples' mean.",
         "Other methods choose their constants on the last quarter of the training samples.",
+        "LIPServe read, filtered and differentiated the recordings for all methods: lines of code are without that. "
+        "Infinite: parameters with an infinite interval, over all splits. mujoco.sysid, forward: residual of simulated "
+        "motion; its accuracy depends on the length of the simulated windows.",
     ]
     if outcome.absent:
         lines.append(f"Not installed: {', '.join(outcome.absent)}.")
