@@ -98,7 +98,8 @@ def _schemas(api: Document) -> Iterator[str]:
         required = set(schema.get("required", ()))
         yield from ("| field | type | meaning |", "| --- | --- | --- |")
         for field, each in fields.items():
-            default = f" Default: `{_cell(str(each['default']))}`." if each.get("default") not in (None, [], {}) else ""
+            plain = each.get("default") not in (None, "", [], {})
+            default = f" Default: `{_cell(str(each['default']))}`." if plain else ""
             optional = "" if field in required else ", optional"
             yield f"| `{field}` | {_type(each)}{optional} | {_meaning(each)}{default} |"
         yield ""

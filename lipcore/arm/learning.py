@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from lipcore.arm.posing import make_problem, mode_of, surroundings, with_load, w
 from lipcore.arm.problem import WIDTHS, Point, Problem, root_of
 from lipcore.arm.right_angles import Candidate, Layout
 from lipcore.arm.scales import rescale
-from lipcore.arm.search import Pool, SearchResult, search
+from lipcore.arm.search import Pool, SearchResult, known_geometries, search
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
@@ -33,7 +34,6 @@ from lipcore.model.selection import MAX_TEXT_LENGTH
 from lipcore.model.texts import list_joints
 from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.selection import spread_out
-from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import GeometryMode
 
 
@@ -102,8 +102,8 @@ def learn(
         mode, around = mode_of(task), surroundings(task)
         order = chain(task.robot, samples.n_joints) if around is None else around.order
         rows = spread_out(samples.motion(), options.posterior_samples)
-        chosen = samples.rows(rows)
-        problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples)
+        chosen, known = samples.rows(rows), [each for each in known if each.roots == task.roots]
+        problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples, task.roots)
         if task.sibling is not None:
             problem = replace(problem, scale_width=WIDTHS.unit)
         urdf = mode == "calibrate" and task.sibling is None
@@ -135,7 +135,7 @@ def learn(
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
         report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
-        report |= _fixed_joints(task.robot)
+        report |= _joints_report(task)
         if result is not None:
             report |= _search_report(result, ends, found)
         report |= {
@@ -205,12 +205,53 @@ def _search(
     seed: int,
     watch: _Watch,
 ) -> SearchResult:
-    """Search for the geometry on a few of the rows `samples` of a problem."""
-    types = tuple(task.joint_types[joint] for joint in order)
-    few = spread_out(samples.motion(), max(OPTIONS.min_search_rows, OPTIONS.search_rows_per_joint * len(types)))
-    sensor = noise_level([task.signals.tau[part][:, order] for part in task.signals.episodes()])
-    seconds = task.options.search_seconds
-    return search(problem.rows(few), types, task.gravity, sensor, seconds, seed, known, watch.searching)
+    """Search for the geometry on a few of the rows `samples` of a problem, for each arm by itself."""
+    arms, seconds, results = _split(task, problem, order, samples), task.options.search_seconds, list[SearchResult]()
+    for number, (joints, part, own) in enumerate(arms):
+        types = tuple(task.joint_types[joint] for joint in joints)
+        few = spread_out(own.motion(), max(OPTIONS.min_search_rows, OPTIONS.search_rows_per_joint * len(types)))
+        sensor = noise_level([task.signals.tau[part][:, joints] for part in task.signals.episodes()])
+        step = partial(watch.searching, part=(number, len(arms)))
+        shapes = (
+            known
+            if len(arms) == 1
+            else [*(each.arms[number][2] for each in known), *known_geometries(types, task.gravity)]
+        )
+        results.append(search(part.rows(few), types, task.gravity, sensor, seconds / len(arms), seed, shapes, step))
+    return results[0] if len(results) == 1 else _join(problem, results)
+
+
+def _split(
+    task: Task, problem: Problem, order: NDArray[np.int64], samples: Samples
+) -> list[tuple[NDArray[np.int64], Problem, Samples]]:
+    """Return the data's joints, the problem and the samples of each arm."""
+    if len(task.roots) == 1:
+        return [(order, problem, samples)]
+    out = []
+    for joints in np.split(order, task.roots[1:]):
+        types = tuple(task.joint_types[joint] for joint in joints)
+        own, every = samples.joints(joints), task.samples.joints(joints)
+        out.append((joints, make_problem(own, types, np.arange(len(types)), task.gravity, None, every), own))
+    return out
+
+
+def _join(problem: Problem, results: Sequence[SearchResult]) -> SearchResult:
+    """Return the optima of all arms: the best with the best, then the next ones."""
+    points = []
+    for rank in range(max(len(each.points) for each in results)):
+        parts = [each.points[min(rank, len(each.points) - 1)] for each in results]
+        geometry = Geometry.joined([each.geometry for each in parts])
+        points.append(problem.at(geometry, np.concatenate([each.sigma for each in parts])))
+    return SearchResult(
+        tuple(points),
+        sum(each.starts for each in results),
+        sum(each.hops for each in results),
+        sum(each.distinct for each in results),
+        min(each.times_best for each in results),
+        all(each.explained for each in results),
+        "time" if any(each.ended == "time" for each in results) else "idle",
+        sum(each.seconds for each in results),
+    )
 
 
 def _refine(
@@ -319,10 +360,11 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
     return bool(np.any(np.sqrt(np.mean((means[0] - means[1]) ** 2, axis=0)) > OPTIONS.min_difference * stated))
 
 
-def _fixed_joints(robot: RigidBody | None) -> dict[str, str]:
-    """Return the report on joints of the URDF that the data lack, such as those of a gripper."""
-    fixed = () if robot is None else robot.fixed_joints
-    return {"fixed_joints": list_joints(fixed)[:MAX_TEXT_LENGTH]} if fixed else {}
+def _joints_report(task: Task) -> dict[str, str | int]:
+    """Return the number of several arms, and the joints of the URDF that the data lack, such as those of a gripper."""
+    fixed = () if task.robot is None else task.robot.fixed_joints
+    report: dict[str, str | int] = {"fixed_joints": list_joints(fixed)[:MAX_TEXT_LENGTH]} if fixed else {}
+    return {**report, "arms": len(task.roots)} if len(task.roots) > 1 else report
 
 
 def _search_report(
@@ -358,9 +400,10 @@ class _Watch:
             most, elapsed = self.task.options.max_iterations, time.monotonic() - self.began
             self.task.on_progress(FitProgress(stage, self.iteration, most, objective, fraction, elapsed))
 
-    def searching(self, objective: float, fraction: float) -> None:
-        """Report a step of the search, the longest part of the work."""
-        self.step("geometry", objective, 0.8 * min(fraction, 1.0))
+    def searching(self, objective: float, fraction: float, part: tuple[int, int] = (0, 1)) -> None:
+        """Report a step of the search, the longest part of the work. part: number of an arm, and count of arms."""
+        number, count = part
+        self.step("geometry", objective, 0.8 * (number + min(fraction, 1.0)) / count)
 
     def stop(self) -> bool:
         """Return whether the caller has cancelled."""

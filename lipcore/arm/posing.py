@@ -58,12 +58,13 @@ def make_problem(
     gravity: bool,
     around: Arm | None = None,
     every: Samples | None = None,
+    roots: tuple[int, ...] = (0,),
 ) -> Problem:
     """Return the problem of learning an arm from N samples, base to tip.
 
     joint_types: (n,), in the order of the data; order: (n,), the data's joint at each place of the chain; gravity:
     whether torques contain it; around: prior arm of geometry and masses; every: all samples, for the size of torques
-    and noise, `samples` if None.
+    and noise, `samples` if None; roots: first joint of each arm, if there is no prior arm.
     """
     n, every = samples.n_joints, samples if every is None else every
     drive = Drive(n)
@@ -92,7 +93,7 @@ def make_problem(
         unit,
         start,
         floor,
-        _expected(types, gravity, around),
+        _expected(types, gravity, around, roots),
         drive,
         np.ones((n, len(BASE_TERMS)), np.bool_),
     )
@@ -110,7 +111,9 @@ def _in_chain(samples: Samples, order: NDArray[np.int64]) -> tuple[Array, Array]
     return np.ascontiguousarray(samples.motion().arrays()[:, :, order]), in_chain(samples.tau, order)
 
 
-def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -> GeometryPrior | None:
+def _expected(
+    types: tuple[JointType, ...], gravity: bool, around: Arm | None, roots: tuple[int, ...]
+) -> GeometryPrior | None:
     if around is not None:
         return GeometryPrior(around.widths, around.geometry.moved(around.expected)) if around.steps else None
     n = len(types)
@@ -120,6 +123,7 @@ def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -
         np.zeros((n, 3)),
         np.tile([0.0, 0.0, 1.0], (n, 1)),
         np.array([0.0, 0.0, -1.0 if gravity else 0.0]),
+        roots,
     )
     return GeometryPrior.anything(any_arm)
 

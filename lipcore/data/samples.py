@@ -61,6 +61,12 @@ class Samples:
         arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "joint_names"}
         return replace(self, **{name: each[index] for name, each in arrays.items() if each is not None})
 
+    def joints(self, index: NDArray[np.int64]) -> Samples:
+        """Return the chosen joints, in this order."""
+        arrays = {name: np.ascontiguousarray(getattr(self, name)[:, index]) for name in ("q", "dq", "ddq", "tau")}
+        known = None if self.deflections is None else np.ascontiguousarray(self.deflections[:, :, index])
+        return replace(self, joint_names=tuple(self.joint_names[joint] for joint in index), deflections=known, **arrays)
+
     def episodes(self) -> list[slice]:
         """Return the contiguous runs of equal `episode`, in order of rows."""
         edges = np.flatnonzero(np.diff(self.episode)) + 1

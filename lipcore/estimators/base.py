@@ -74,5 +74,7 @@ def check_base(
         raise BaseMismatchError("robot", robot, "no robot together with a base: the base's arm is used")
     if options.geometry == "learn":
         raise BaseMismatchError("options.geometry", "learn", "auto, calibrate or fixed if a base is given")
+    if options.arms:
+        raise BaseMismatchError("options.arms", options.arms, "the default if a base is given: its arms are used")
     if options.prior != "urdf":
         raise BaseMismatchError("options.prior", options.prior, "the default if a base is given: its masses are used")

@@ -25,7 +25,7 @@ from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.residual import ResidualKernel
 from lipcore.robots.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, LOCAL, ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, CHAINED_ARM, ESTIMATOR_CHOICES, LOCAL, ROBOT_ESTIMATORS, JointType
 
 
 class UnknownEstimatorError(ValueError):
@@ -99,6 +99,7 @@ def make_estimator(
         return Estimator(name, terms)
     if arm.joint_types != types:
         raise JointMismatchError(f"the arm has joints {arm.joint_types}, the data have {types}")
+    _check_arms(name, len(arm.geometry.roots))
     return Estimator(name, {"rigid_body": ArmKernel(arm), **terms})
 
 
@@ -114,7 +115,13 @@ def check_estimator(
     if name not in ESTIMATOR_CHOICES:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATOR_CHOICES)}")
     types = check_joint_types(joint_types)
+    sizes = () if options is None else options.sizes
+    if sizes and (robot is not None or sum(sizes) != len(types) or name not in (AUTO, *ROBOT_ESTIMATORS)):
+        users = ", ".join((AUTO, *ROBOT_ESTIMATORS))
+        expected = f"numbers whose sum is {len(types)}, the joints of the data, no robot, and one of {users}"
+        raise ValueError(f"arms is {','.join(map(str, sizes))!r}, expected {expected}")
     if robot is None:
+        _check_arms(name, len(sizes))
         if name in (AUTO, *ROBOT_ESTIMATORS) and options is not None and options.geometry in ("calibrate", "fixed"):
             raise MissingRobotError(
                 f"geometry is {options.geometry!r}, which needs a robot: a profile such as panda, or a URDF"
@@ -125,11 +132,20 @@ def check_estimator(
         raise MissingRobotError(f"estimator {name!r} does not use a robot, only {users} and {AUTO} do")
     if robot.joint_types != types:
         raise JointMismatchError(f"robot {robot.name!r} has joints {robot.joint_types}, the data have {types}")
-    if name == "rigid-body+lip-chain" and robot.order != tuple(range(robot.n_joints)):
+    _check_arms(name, len(robot.roots))
+    if name == CHAINED_ARM and robot.order != tuple(range(robot.n_joints)):
         order = [robot.joint_names[robot.order.index(place)] for place in range(robot.n_joints)]
         raise JointMismatchError(
             f"estimator {name!r} needs joints from base to tip, {', '.join(order)}; the data have "
             f"{', '.join(robot.joint_names)}"
+        )
+
+
+def _check_arms(name: str, arms: int) -> None:
+    if name == CHAINED_ARM and arms > 1:
+        raise JointMismatchError(
+            f"estimator {name!r} needs one serial chain, but the robot has {arms} arms: use rigid-body, "
+            "rigid-body+local or auto"
         )
 
 

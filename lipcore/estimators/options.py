@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, get_args
@@ -47,6 +48,9 @@ class FitOptions:
     geometry: GeometryOption = "auto"
     """Geometry of rigid bodies: "learn", "calibrate" (around the URDF), "fixed" (that of the URDF), or "auto":
     calibrated if there is a robot, else learnt."""
+    arms: str = ""
+    """Numbers of joints of the arms on one base, such as "7,7", arm after arm in the order of the data. Empty: the arms
+    of the robot, or one."""
     search_seconds: float = 30.0
     """Max processor time of the search for a geometry, s. The search lasts longer on a busy machine."""
 
@@ -73,8 +77,17 @@ class FitOptions:
                 raise ValueError(f"{name} is {number!r}, expected a number above 0, at most {most:g}")
         if self.geometry not in ("auto", *GEOMETRY_MODES):
             raise ValueError(f"geometry is {self.geometry!r}, expected one of auto, {', '.join(GEOMETRY_MODES)}")
+        if not re.fullmatch(r"([1-9]\d{0,2}(,[1-9]\d{0,2}){1,99})?", self.arms):
+            raise ValueError(
+                f"arms is {self.arms!r}, expected the number of joints of each of several arms, such as 7,7"
+            )
         if self.prior not in PRIORS:
             raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Numbers of joints of the arms, empty if they are those of the robot, or one."""
+        return tuple(map(int, self.arms.split(","))) if self.arms else ()
 
     def check_device(self, estimator: str) -> None:
         """Raise ValueError if `device` is "cuda" and the estimator does not benefit from a GPU."""

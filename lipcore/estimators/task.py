@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 
 import numpy as np
 
@@ -67,6 +68,14 @@ class Task:
     def gravity(self) -> bool:
         """Whether torques contain gravity."""
         return self.torque_convention == "gravity_included"
+
+    @property
+    def roots(self) -> tuple[int, ...]:
+        """First joint of each arm, arm after arm from base to tip."""
+        if self.sibling is not None:
+            return self.sibling.geometry.roots
+        sizes = self.options.sizes
+        return self.robot.roots if self.robot is not None else (0, *accumulate(sizes[:-1]))
 
     @property
     def signals(self) -> Samples:

@@ -41,7 +41,7 @@ class BodiesProgram:
         n, graph = geometry.n_joints, Graph()
         q, dq, ddq, *turn = (graph.inputs(n) for _ in QUERY)
         more = graph.inputs(PAYLOAD)
-        found = torque(*links_of(geometry, step, bodies, change), q, dq, ddq, turn, more)
+        found = torque(links_of(geometry, step, bodies, change), q, dq, ddq, turn, more)
         results = {f"load[{j}]": each.value for j, each in enumerate(found)}
         results |= {f"tau[{j}]": each.value + each.change for j, each in enumerate(found)}
         rows, weights, first = features(geometry, bodies, len(step) > 0, q, dq, ddq, turn, more)
@@ -59,7 +59,7 @@ def others_statements(arms: Iterable[tuple[Geometry, Array]]) -> str:
             texts = _query_texts(geometry.n_joints)
             q, dq, ddq, *turn = (graph.inputs(geometry.n_joints) for _ in QUERY)
         links = links_of(geometry, np.zeros(0), bodies, np.zeros_like(bodies))
-        for j, each in enumerate(torque(*links, q, dq, ddq, turn)):
+        for j, each in enumerate(torque(links, q, dq, ddq, turn)):
             results[f"tau[{k}][{j}]"] = each.value
     return _statements(results, texts)
 

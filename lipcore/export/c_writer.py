@@ -158,6 +158,11 @@ def _texts(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
         joints.append(f" *       {k}  {_comment(name)}, {model.joint_types[k]}, trained for {', '.join(seen)}")
     mode = model.arm is not None and model.arm.mode == "learn"
     frame = "in the last link's frame of the learnt arm, see\n * `parameters.geometry` of the version"
+    last = "the URDF's last movable joint"
+    if model.arms > 1 and model.arm is not None:
+        last = (
+            f"joint\n * {_comment(model.joint_names[model.arm.order[-1]])}, the last arm's; other arms have no payload"
+        )
     return {
         "title": f"Inverse dynamics of {_comment(origin.model)}, version {origin.version}",
         "model": _comment(origin.model),
@@ -170,7 +175,7 @@ def _texts(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
         "names": "{" + ", ".join(_string(name) for name in names) + "}",
         "name_size": str(max(map(len, names)) + 1),
         "model_text": _string(origin.model.encode()),
-        "frame": frame if mode else "in the frame of the URDF's last movable joint",
+        "frame": frame if mode and model.arms == 1 else f"in the frame of {last}",
     }
 
 

@@ -70,7 +70,7 @@ def reach_of(arm: SimulatedArm) -> Array:
     for k in range(len(steps) - 1, -1, -1):
         beyond = max(float(np.linalg.norm(arm.bodies[k, 1:4])) / arm.bodies[k, 0], beyond)
         out[k] = beyond
-        beyond += steps[k]
+        beyond = 0.0 if k in arm.geometry.roots else beyond + steps[k]
     return out
 
 

@@ -62,9 +62,10 @@ def mjcf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
     if sheet is not None:
         _custom(root, sheet)
     line = line_radius(reach_of(arm))
-    body = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name=BASE)
-    body.set("quat", _quaternion(upright(geometry.gravity)))
+    base = body = ElementTree.SubElement(ElementTree.SubElement(root, "worldbody"), "body", name=BASE)
+    base.set("quat", _quaternion(upright(geometry.gravity)))
     for k, joint in enumerate(joints.names):
+        body = base if k in geometry.roots else body
         _line(body, geometry.translation[k], line)
         place, turn = join_values(geometry.translation[k]), _quaternion(geometry.rotation[k])
         body = ElementTree.SubElement(body, "body", name=f"{joint}_link", pos=place, quat=turn)

@@ -54,16 +54,18 @@ def urdf_text(arm: SimulatedArm, name: str = "arm", sheet: Sheet | None = None) 
         ElementTree.SubElement(robot, "link", name=ROOT)
         fixed = _unlike(f"{ROOT}_to_{BASE}", joints.names)
         _joint(robot, fixed, "fixed", ROOT, BASE, turn, np.zeros(3))
-    _link(robot, BASE, None, geometry.translation[0], line)
+    _link(robot, BASE, None, [geometry.translation[root] for root in geometry.roots], line)
     effort = _effort(bodies, joints, reach)
     for k, joint in enumerate(joints.names):
+        parent = BASE if k in geometry.roots else parent
         child = f"{joint}_link"
         made = _joint(
             robot, joint, geometry.joint_types[k], parent, child, geometry.rotation[k], geometry.translation[k]
         )
         _moving(made, geometry.axis[k], joints, k, float(effort[k]))
         add_comments(made, joint_comments(arm, k, sheet))
-        _link(robot, child, bodies[k], geometry.translation[k + 1] if k + 1 < n else None, line)
+        following = [] if k + 1 in (*geometry.roots, n) else [geometry.translation[k + 1]]
+        _link(robot, child, bodies[k], following, line)
         parent = child
     for joint, rotor in zip(joints.names, joints.rotor, strict=True):
         _transmission(robot, joint, float(rotor))
@@ -110,8 +112,8 @@ def _moving(joint: Element, axis: Array, joints: ArmJoints, k: int, effort: floa
     ElementTree.SubElement(joint, "dynamics", {key: value_text(max(value, 0.0)) for key, value in terms.items()})
 
 
-def _link(robot: Element, name: str, body: Array | None, end: Array | None, line: float) -> None:
-    """Write a link with its mass, a sphere at its centre of mass, and a line to the frame of the next joint."""
+def _link(robot: Element, name: str, body: Array | None, ends: Sequence[Array], line: float) -> None:
+    """Write a link with its mass, a sphere at its centre of mass, and lines to the frames of the next joints."""
     link = ElementTree.SubElement(robot, "link", name=name)
     if body is not None:
         mass, (centre, about) = float(body[0]), inertia_at_centre(body)
@@ -121,10 +123,11 @@ def _link(robot: Element, name: str, body: Array | None, end: Array | None, line
         entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
         ElementTree.SubElement(inertial, "inertia", {key: value_text(about[at]) for key, at in entries.items()})
         ElementTree.SubElement(_visual(link, centre), "sphere", radius=f"{ball_radius(mass):.4f}")
-    length = 0.0 if end is None else float(np.linalg.norm(end))
-    if end is not None and length > line:
-        cylinder = _visual(link, 0.5 * end, rotation_to_axis((end / length).tolist()))
-        ElementTree.SubElement(cylinder, "cylinder", radius=f"{line:.4f}", length=f"{length:.4f}")
+    for end in ends:
+        length = float(np.linalg.norm(end))
+        if length > line:
+            cylinder = _visual(link, 0.5 * end, rotation_to_axis((end / length).tolist()))
+            ElementTree.SubElement(cylinder, "cylinder", radius=f"{line:.4f}", length=f"{length:.4f}")
 
 
 def _visual(link: Element, place: Array, rotation: Array | None = None) -> Element:

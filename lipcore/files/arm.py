@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +24,7 @@ _TENSORS = {
         *_GEOMETRY_TENSORS,
         *_ARM_TENSORS,
         "order",
+        "roots",
         "rotor",
         "drive",
         "acceleration",
@@ -43,6 +45,8 @@ def arm_tensors(arm: Arm) -> dict[str, Array]:
         name: getattr(arm, name) for name in _ARM_TENSORS
     }
     parts["order"] = arm.order.astype(np.float64)
+    if len(arm.geometry.roots) > 1:
+        parts["roots"] = np.array(arm.geometry.roots, np.float64)
     if arm.rotor.any():
         parts["rotor"] = arm.rotor
     if arm.drive:
@@ -75,7 +79,11 @@ def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mod
     if order.shape != (len(joint_types),) or sorted(order.tolist()) != list(range(len(joint_types))):
         raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")
     types = tuple(joint_types[joint] for joint in order)
-    geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY_TENSORS))
+    roots = tensors.get(f"{PREFIX}roots", np.zeros(1))  # stored for several arms
+    if roots.ndim != 1 or not np.isfinite(roots).all():
+        raise ValueError(f"tensor 'arm/roots' is {quote(roots.tolist())}, expected the first joint of each arm")
+    frames = {name: parts.pop(name) for name in _GEOMETRY_TENSORS}
+    geometry = Geometry(types, **frames, roots=tuple(map(int, roots)))
     rotor = tensors.get(f"{PREFIX}rotor")  # rotors of zero inertia are not stored
     parts["rotor"] = np.zeros(len(types)) if rotor is None else rotor
     drive, acceleration = _drive(tensors), tensors.get(f"{PREFIX}acceleration")
@@ -129,7 +137,7 @@ def _alternatives(tensors: Mapping[str, Array], geometry: Geometry, terms: int) 
         raise ValueError("tensor 'arm/other/probability' has a number outside 0 to 1")
     return tuple(
         Alternative(
-            Geometry(geometry.joint_types, rotation[k], translation[k], axis[k], geometry.gravity),
+            replace(geometry, rotation=rotation[k], translation=translation[k], axis=axis[k]),
             parameters[k],
             linear[k, :, 0],
             np.ascontiguousarray(linear[k, :, 1:]),

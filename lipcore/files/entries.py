@@ -111,6 +111,8 @@ class Joint(JointPose):
     undetermined: tuple[Annotated[str, one_of(STEPS)], ...]
     plausible: JointPose | UnsetType = UNSET
     """Pose for the plausible bodies, if it differs."""
+    root: bool | UnsetType = UNSET
+    """True for the first joint of a further arm, whose pose is in the base's frame."""
 
     def __post_init__(self) -> None:
         for name in ("turn_std", "shift_std"):
@@ -119,7 +121,7 @@ class Joint(JointPose):
 
 
 class Chain(Entry):
-    """Joints from base to tip. order: the data's joint at each index."""
+    """Joints from base to tip, arm after arm. order: the data's joint at each index."""
 
     mode: Annotated[str, one_of(GEOMETRY_MODES)]
     gravity: Vector
@@ -142,6 +144,7 @@ class Chain(Entry):
             rotation=np.array([place.rotation for place in places]),
             translation=np.array([place.translation for place in places]),
             axis=np.array([joint.axis for joint in self.joints]),
+            roots=(0, *(index for index, joint in enumerate(self.joints) if joint.root is True)),
         )
 
 

@@ -122,11 +122,13 @@ class ArmKernel(LinearKernel):
         return ArmRegressor(self)
 
     def of_joint(self, joint: int) -> NDArray[np.int64]:
-        """Return the places of the weights that a joint's torque may depend on: not of the bodies before it."""
-        n, place = self.n_joints, self.arm.place
+        """Return the places of the weights that a joint's torque may depend on: of its arm, not of bodies before it."""
+        n, place, own = self.n_joints, self.arm.place, self.arm.arm_of == self.arm.arm_of[joint]
         used = np.ones(self.size, dtype=bool)
-        used[: PARAMETERS * n] = np.repeat(place >= place[joint], PARAMETERS)
+        used[: PARAMETERS * n] = np.repeat((place >= place[joint]) & own, PARAMETERS)
         used[PARAMETERS * n : self.steps.start] = np.arange(n) == joint
+        if self.arm.steps:
+            used[self.steps] = np.repeat(own[self.arm.order], self.arm.geometry.screws)
         return np.flatnonzero(used)
 
     def variances(self, params: Params) -> Array:

@@ -39,7 +39,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Arm:
-    """Rigid bodies, with torque linearised around a geometry and inertial parameters."""
+    """Rigid bodies of one arm, or of several on one base, with torque linearised around geometry and parameters."""
 
     geometry: Geometry
     """Geometry, base to tip."""
@@ -105,6 +105,11 @@ class Arm:
         return np.argsort(self.order)
 
     @property
+    def arm_of(self) -> NDArray[np.int64]:
+        """Index of the arm of each joint of the data, (n,)."""
+        return self.geometry.arm_of[self.place]
+
+    @property
     def joint_types(self) -> tuple[JointType, ...]:
         """Types of the joints, (n,), in the order of the data."""
         return tuple(self.geometry.joint_types[place] for place in self.place)
@@ -155,7 +160,8 @@ def widths_of(geometry: Geometry) -> Array:
     the torque as noise.
     """
     widths = np.where(geometry.turns, 0.005, 0.003)
-    widths[: geometry.screws[0]] = 0.02
+    for _, numbers, arm in geometry.arms:
+        widths[numbers][: arm.screws[0]] = 0.02
     return widths
 
 

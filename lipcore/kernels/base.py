@@ -109,7 +109,11 @@ class State:
 
     def first(self, joints: int) -> State:
         """Return the first `joints` joints: the chain up to a link."""
-        return State(self.q[:joints], self.v[:joints], self.a[:joints])
+        return self.part(slice(joints))
+
+    def part(self, joints: slice) -> State:
+        """Return some of the joints."""
+        return State(self.q[joints], self.v[joints], self.a[joints])
 
 
 class TorqueKernel(ABC):

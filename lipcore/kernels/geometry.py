@@ -1,4 +1,4 @@
-"""Geometry of the joint axes of a serial arm.
+"""Geometry of the joint axes of a serial arm, or of several on one fixed base.
 
 Every joint has a frame, placed in the frame of the joint before it. Its axis is a fixed vector of its own frame. Torque
 depends on the axis of a joint relative to the one before: two turns and two shifts across the axis. A prismatic joint
@@ -13,15 +13,17 @@ axes the place of the common normal is undetermined. A small turn of an axis the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Array
-from lipcore.kernels.fast.arm_recursion import ACROSS, AXIS, CONSTANTS, KIND, PLACE, SCREWS, TURN
+from lipcore.kernels.fast.arm_recursion import ACROSS, AXIS, CONSTANTS, KIND, PLACE, ROOT, SCREWS, TURN
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 
@@ -31,18 +33,23 @@ STANDARD_GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Geometry:
-    """Geometry of a serial arm of n joints, from base to tip."""
+    """Geometry of n joints, from base to tip, arm after arm.
+
+    Arms share only the fixed base, so the torque of an arm depends on its own joints alone.
+    """
 
     joint_types: tuple[JointType, ...]
     """`revolute` or `prismatic`, (n,)."""
     rotation: Array
-    """Axes of joint j's frame in the frame of joint j − 1 (the first: in the base's frame) at q_j = 0, (n, 3, 3)."""
+    """Axes of joint j's frame in the frame of joint j − 1 (of a root: in the base's frame) at q_j = 0, (n, 3, 3)."""
     translation: Array
     """Origin of joint j's frame in the same frame, (n, 3) m."""
     axis: Array
     """Unit vectors of the axes in the joints' own frames, (n, 3)."""
     gravity: Array
     """Gravity in the base's frame, (3,) m/s²; zero if torques do not contain it."""
+    roots: tuple[int, ...] = (0,)
+    """First joint of each arm, rising from 0."""
 
     def __post_init__(self) -> None:
         check_joint_types(self.joint_types)
@@ -51,6 +58,8 @@ class Geometry:
             value = getattr(self, name)
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} has shape {value.shape}, expected finite numbers of shape {shape}")
+        if list(self.roots) != sorted({0, *self.roots}) or self.roots[-1] >= n:
+            raise ValueError(f"roots is {self.roots}, expected rising joints from 0 to {n - 1} that begin with 0")
         if not np.allclose(self.rotation @ self.rotation.mT, np.eye(3), atol=1e-6):
             raise ValueError("rotation contains a matrix that is not a rotation")
         if not np.allclose(np.linalg.norm(self.axis, axis=1), 1.0, atol=1e-6):
@@ -68,12 +77,41 @@ class Geometry:
             np.array([place.translation for place in places]),
             axes,
             np.array(model.gravity.linear) if gravity else np.zeros(3),
+            robot.roots,
+        )
+
+    @classmethod
+    def joined(cls, arms: Sequence[Geometry]) -> Geometry:
+        """Return several arms on one base. They have the gravity of the first."""
+        return cls(
+            tuple(kind for each in arms for kind in each.joint_types),
+            np.concatenate([each.rotation for each in arms]),
+            np.concatenate([each.translation for each in arms]),
+            np.concatenate([each.axis for each in arms]),
+            arms[0].gravity,
+            (0, *accumulate(each.n_joints for each in arms[:-1])),
         )
 
     @property
     def n_joints(self) -> int:
         """Number of joints n."""
         return len(self.joint_types)
+
+    @cached_property
+    def arm_of(self) -> NDArray[np.int64]:
+        """Index of each joint's arm, (n,)."""
+        return np.searchsorted(self.roots, np.arange(self.n_joints), side="right") - 1
+
+    @cached_property
+    def arms(self) -> tuple[tuple[slice, slice, Geometry], ...]:
+        """Joints of each arm, places of its numbers in a step, and its geometry."""
+        out, first = [], 0
+        for root, end in pairwise((*self.roots, self.n_joints)):
+            joints, size = slice(root, end), sum(self.screws[root:end])
+            types, frames = self.joint_types[joints], (self.rotation[joints], self.translation[joints])
+            out.append((joints, slice(first, first + size), Geometry(types, *frames, self.axis[joints], self.gravity)))
+            first += size
+        return tuple(out)
 
     @cached_property
     def across(self) -> Array:
@@ -85,9 +123,10 @@ class Geometry:
 
     @property
     def screws(self) -> tuple[int, ...]:
-        """Count of identifiable numbers of each joint: four, two if it is prismatic, two or none for the first."""
+        """Count of identifiable numbers of each joint: four, two if it is prismatic, two or none for a root."""
         first = 2 if np.any(self.gravity) else 0
-        return (first, *(4 if kind == "revolute" else 2 for kind in self.joint_types[1:]))
+        counts = [4 if kind == "revolute" else 2 for kind in self.joint_types]
+        return tuple(first if joint in self.roots else count for joint, count in enumerate(counts))
 
     @property
     def size(self) -> int:
@@ -110,6 +149,7 @@ class Geometry:
         out[:, ACROSS:KIND] = (self.across @ self.rotation.mT).reshape(n, -1)
         out[:, KIND] = [kind == "prismatic" for kind in self.joint_types]
         out[:, SCREWS] = self.screws
+        out[:, ROOT] = np.array(self.roots)[self.arm_of]
         return out
 
     def moved(self, step: Array) -> Geometry:
@@ -160,13 +200,13 @@ class Geometry:
     def canonical(self) -> Geometry:
         """Return the same arm with each frame where its axis comes closest to the frame before.
 
-        The first frame is at the base. Torque does not depend on the position of a frame along its axis. This applies
-        to revolute joints only: a prismatic joint's frame stays at the origin of the one before.
+        The first frame of each arm is at the base. Torque does not depend on the position of a frame along its axis.
+        This applies to revolute joints only: a prismatic joint's frame stays at the origin of the one before.
         """
         translation, moved = self.translation.copy(), np.zeros(3)
         for j, kind in enumerate(self.joint_types):
-            place = translation[j] - moved
-            if j == 0 or kind == "prismatic":
+            place = translation[j] if j in self.roots else translation[j] - moved
+            if j in self.roots or kind == "prismatic":
                 kept = np.zeros(3)
             else:
                 axis = self.rotation[j] @ self.axis[j]
@@ -182,6 +222,8 @@ class Geometry:
         """Return rotations (n, 3, 3) and origins (n, 3) m of all joint frames in the base's frame at q, (n,)."""
         turn, place, turns, places = np.eye(3), np.zeros(3), [], []
         for j, kind in enumerate(self.joint_types):
+            if j in self.roots:
+                turn, place = np.eye(3), np.zeros(3)
             place, turn = place + turn @ self.translation[j], turn @ self.rotation[j]
             if kind == "revolute":
                 turn = turn @ rotation_of(self.axis[j] * q[j])

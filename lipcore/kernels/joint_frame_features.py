@@ -34,12 +34,12 @@ def features(
     `joint_frames.torque`; all are numbers of one graph.
     """
     n, graph = geometry.n_joints, q[0].graph
-    gravity, links = links_of(geometry, np.zeros(0), bodies, np.zeros_like(bodies))
+    links = links_of(geometry, np.zeros(0), bodies, np.zeros_like(bodies))
     entries = [(j, *each) for j, link in enumerate(links) for each in (PRISMATIC if link.slides else REVOLUTE)]
     moved = [j for j, count in enumerate(geometry.screws if is_learnt else ()) for _ in range(count)]
-    steps = [links_of(geometry, each, bodies, np.zeros_like(bodies))[1] for each in np.eye(len(moved))]
+    steps = [links_of(geometry, each, bodies, np.zeros_like(bodies)) for each in np.eye(len(moved))]
     units = np.eye(bodies.size).reshape(-1, *bodies.shape)
-    changes = [*(links_of(geometry, np.zeros(0), bodies, each)[1] for each in units), *steps]
+    changes = [*(links_of(geometry, np.zeros(0), bodies, each) for each in units), *steps]
     expand = np.zeros((len(changes), len(entries) + len(moved)))
     expand[:, : len(entries)] = [[each[j].body[1][row, column] for j, row, column in entries] for each in changes]
     expand[len(units) :, len(entries) :] = np.eye(len(moved))
@@ -55,7 +55,7 @@ def features(
         replace(link, tilt=tilts[j], place=(link.place[0], places[j]), body=(link.body[0], bodies_of[j]))
         for j, link in enumerate(links)
     ]
-    torques = torque(gravity, tuple(changed), q, dq, ddq, turn, more)
+    torques = torque(tuple(changed), q, dq, ddq, turn, more)
     return _distinct(jacobian([each.change for each in torques], symbols), expand, n)
 
 

@@ -12,7 +12,7 @@ Each number is computed together with its change by a step of the geometry or of
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -61,14 +61,21 @@ class Link:
     """Origin in the frame before, (3,) m."""
     body: Pair
     """∫ r rᵀ dm of r = (x, y, z, 1), (4, 4): second moments, first moment and mass."""
+    gravity: Array | None
+    """Gravity in the frame before, (3,) m/s², if this is the first link of an arm."""
 
 
-def links_of(geometry: Geometry, step: Array, bodies: Array, change: Array) -> tuple[Array, tuple[Link, ...]]:
-    """Return gravity, (3,), and the links, base to tip, of an arm with torque Y π and change J δθ + Y δπ.
+def links_of(geometry: Geometry, step: Array, bodies: Array, change: Array) -> tuple[Link, ...]:
+    """Return the links, base to tip and arm after arm, with torque Y π and change J δθ + Y δπ.
 
-    step: δθ, (g,), empty for none; bodies: π, change: δπ, (n, 10). The last frame has the axes of `across` and `axis`
-    of the geometry, and its origin.
+    step: δθ, (g,), empty for none; bodies: π, change: δπ, (n, 10). The last frame of an arm has the axes of `across`
+    and `axis` of the geometry, and its origin.
     """
+    arms = ((arm, step[numbers], bodies[joints], change[joints]) for joints, numbers, arm in geometry.arms)
+    return tuple(link for parts in arms for link in _links_of_arm(*parts))
+
+
+def _links_of_arm(geometry: Geometry, step: Array, bodies: Array, change: Array) -> list[Link]:
     n = geometry.n_joints
     numbers = geometry.numbers(step) if len(step) else np.zeros((n, 4))
     axes = np.concatenate([geometry.across, geometry.axis[:, None]], axis=1).mT
@@ -92,24 +99,24 @@ def links_of(geometry: Geometry, step: Array, bodies: Array, change: Array) -> t
         to_own = np.linalg.inv(_frame(axes[j] @ _about_z(following), slid * geometry.axis[j]))
         body = to_own @ _moments(bodies[j]) @ to_own.T, to_own @ _moments(change[j]) @ to_own.T
         placed = pair[0][:3, 3], pair[1][:3, 3]
-        links.append(
-            Link(kind == "prismatic", angle, last + following, np.array([tilt[2, 1], tilt[0, 2]]), placed, body)
-        )
-    return _about_z(euler[0][0]).T @ geometry.gravity, tuple(_grouped(links))
+        tilted = np.array([tilt[2, 1], tilt[0, 2]])
+        gravity = None if j else _about_z(first).T @ geometry.gravity
+        links.append(Link(kind == "prismatic", angle, last + following, tilted, placed, body, gravity))
+    return _grouped(links)
 
 
-def torque(
-    gravity: Array, links: tuple[Link, ...], q: Any, dq: Any, ddq: Any, turn: Any, more: Any = None
-) -> list[Dual]:
+def torque(links: tuple[Link, ...], q: Any, dq: Any, ddq: Any, turn: Any, more: Any = None) -> list[Dual]:
     """Return the torques, (n,), base to tip.
 
     q, dq, ddq: (n,); turn: sine and cosine of q, (2, n). more: ten parameters of a body to add to the last one. All are
     sequences of floats, or of objects that calculate like them.
     """
     still = [Dual(0.0)] * 3
-    turning, turned, moved = still, still, [Dual(-float(each)) for each in gravity]
+    turning = turned = moved = still
     at: list[tuple[Any, ...]] = []
     for j, link in enumerate(links):
+        if link.gravity is not None:
+            turning, turned, moved = still, still, [Dual(-float(each)) for each in link.gravity]
         place, rates = _pairs(link.place), _rates(turning, turned)
         sine, cosine = np.sin(link.phase), np.cos(link.phase)
         z = Dual(sine), Dual(cosine)
@@ -136,6 +143,8 @@ def torque(
         out.append((force if link.slides else moment)[2])
         force = _out_of(link, z, force)
         moment = _added(_out_of(link, z, moment), _cross(place, force))
+        if link.gravity is not None:
+            moment, force = still, still
     return out[::-1]
 
 
@@ -220,7 +229,7 @@ def _grouped(links: list[Link]) -> list[Link]:
             moved = body[0] * mask, body[1] * mask
             added = _product(_product(place, moved), (place[0].T, place[1].T))
             body = body[0] - moved[0], body[1] - moved[1]
-        grouped.append(Link(link.slides, link.angle, link.phase, link.tilt, link.place, body))
+        grouped.append(replace(link, body=body))
     return grouped[::-1]
 
 

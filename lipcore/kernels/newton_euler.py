@@ -2,8 +2,9 @@
 
 They are written in the array API: NumPy, PyTorch or JAX compute them. `kernels.fast.arm` computes the same, compiled.
 
-Joints and bodies are in order from base to tip. Coordinates are those of the base; spatial motions (ω, v) and forces
-(n, f) are about its origin. The three coordinates are the first axis of an array, then come joints, then the batch.
+Joints and bodies are in order from base to tip, arm after arm. Coordinates are those of the base; spatial motions
+(ω, v) and forces (n, f) are about its origin. The three coordinates are the first axis of an array, then come joints,
+then the batch.
 """
 
 from __future__ import annotations
@@ -87,8 +88,8 @@ def rigid_body_torque(geometry: Geometry, bodies: Array, x: State) -> Array:
 
     geometry: θ; bodies: π, (n, 10); x: motion of the joints.
     """
-    chain = _chain(geometry, x)
-    return _power(chain.screw, _bodies(chain, bodies).behind().force)
+    torques = [_torque(_chain(arm, x.part(joints)), bodies[joints]) for joints, _, arm in geometry.arms]
+    return array_namespace(x.q).concat(torques)
 
 
 def rigid_body_features(geometry: Geometry, bodies: Array, x: State) -> tuple[Array, Array]:
@@ -96,15 +97,33 @@ def rigid_body_features(geometry: Geometry, bodies: Array, x: State) -> tuple[Ar
 
     Arguments are those of `rigid_body_torque`. Columns are torques.
     """
-    chain = _chain(geometry, x)
-    return _by_bodies(chain), _by_steps(geometry, chain, _bodies(chain, bodies))
+    xp, n = array_namespace(x.q), geometry.n_joints
+    masses, steps = list[Array](), list[Array]()
+    for joints, _, arm in geometry.arms:
+        chain = _chain(arm, x.part(joints))
+        for rows, of_arm in (
+            (masses, _by_bodies(chain)),
+            (steps, _by_steps(arm, chain, _bodies(chain, bodies[joints]))),
+        ):
+            none = xp.zeros_like(of_arm[:, :1])
+            rows.append(xp.concat([none] * joints.start + [of_arm] + [none] * (n - joints.stop), axis=1))
+    return xp.concat(masses), xp.concat(steps)
 
 
 def linearised_torque(geometry: Geometry, bodies: Array, x: State, around: Array, step: Array) -> Array:
     """Return Y π + J δθ, (n, *batch) N·m, with J at the bodies `around`, (n, 10). step: δθ, (g,)."""
-    chain = _chain(geometry, x)
-    torque = _power(chain.screw, _bodies(chain, bodies).behind().force)
-    return torque + _along(chain, _bodies(chain, around), geometry.numbers(step).T) if step.any() else torque
+    torques = []
+    for joints, numbers, arm in geometry.arms:
+        chain = _chain(arm, x.part(joints))
+        torque = _torque(chain, bodies[joints])
+        if (own := step[numbers]).any():
+            torque = torque + _along(chain, _bodies(chain, around[joints]), arm.numbers(own).T)
+        torques.append(torque)
+    return array_namespace(x.q).concat(torques)
+
+
+def _torque(chain: Chain, bodies: Array) -> Array:
+    return _power(chain.screw, _bodies(chain, bodies).behind().force)
 
 
 def _chain(geometry: Geometry, x: State) -> Chain:

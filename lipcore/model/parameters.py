@@ -296,6 +296,7 @@ def _report_arm(
                     for name, one, other in zip(STEPS, std, usual, strict=False)
                     if one > UNIDENTIFIABLE_SHARE * other
                 ],
+                **({"root": True} if place and place in geometry.roots else {}),
             }
         )
     return {

@@ -37,9 +37,12 @@ from lipcore.posterior.statistics import make_solution
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
+ONE_ARM = "but payloads are supported for one arm: train a model for each arm"
+"""What to do if a model has several arms."""
+
 
 class NoArmError(ValueError):
-    """The model has no rigid bodies that a payload could be added to."""
+    """The model has no rigid bodies that a payload could be added to, or several arms."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class PayloadPosterior:
 
 @dataclass(frozen=True)
 class Carrier:
-    """A model with an arm that can carry a payload. Raise NoArmError if it has no arm."""
+    """A model with an arm that can carry a payload. Raise NoArmError if it has no arm, or several."""
 
     model: TorqueModel
 
@@ -79,6 +82,8 @@ class Carrier:
                 f"estimator {self.model.estimator.name!r} has no rigid bodies, expected a model of estimator "
                 f"{', '.join(ROBOT_ESTIMATORS)}"
             )
+        if self.model.arms > 1:
+            raise NoArmError(f"the model has {self.model.arms} arms, {ONE_ARM}")
 
     def has_same_posterior(self, other: Carrier) -> bool:
         """Return whether another revision has the same posterior.

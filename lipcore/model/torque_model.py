@@ -100,9 +100,14 @@ class TorqueModel:
 
     @property
     def arm(self) -> Arm | None:
-        """The learnt rigid bodies, if the estimator has them."""
+        """The learnt rigid bodies of all arms, if the estimator has them."""
         term = self.estimator.terms.get("rigid_body")
         return term.arm if isinstance(term, ArmKernel) else None
+
+    @property
+    def arms(self) -> int:
+        """Number of arms on the base, 0 without rigid bodies."""
+        return 0 if self.arm is None else len(self.arm.geometry.roots)
 
     @cached_property
     def geometry(self) -> Geometry | None:

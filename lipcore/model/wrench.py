@@ -49,8 +49,8 @@ class Wrench:
 
 
 def has_wrench(model: TorqueModel) -> bool:
-    """Return whether a model's arm has the geometry of a URDF and enough joints for a wrench."""
-    return model.arm is not None and model.arm.mode != "learn" and model.n_joints >= 6
+    """Return whether a model has one arm, with the geometry of a URDF and enough joints for a wrench."""
+    return model.arm is not None and model.arms == 1 and model.arm.mode != "learn" and model.n_joints >= 6
 
 
 def external_wrench(
@@ -68,7 +68,8 @@ def external_wrench(
         tool: Pose of the tool's frame in the last link's, (4, 4), m. Default: the last link's own frame.
 
     Raises:
-        NoWrenchError: The geometry is learnt, the arm has less than 6 joints, or the posture is singular.
+        NoWrenchError: The geometry is learnt, the model has several arms, the arm has less than 6 joints, or the
+            posture is singular.
 
     Example:
         >>> external_wrench(model, motion, tau).base_std
@@ -79,6 +80,8 @@ def external_wrench(
             "the geometry of this model is learnt from torque, which does not determine where its links are. Train "
             "with a URDF and the option geometry fixed or calibrate"
         )
+    if model.arms > 1:
+        raise NoWrenchError(f"the model has {model.arms} arms; a wrench needs a model of one arm. Train one for each")
     answer = model.answer_fully(motion, covariance=True)
     assert answer.covariance is not None
     factor = model.scale if scale is None else scale

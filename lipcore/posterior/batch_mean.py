@@ -41,7 +41,7 @@ class BatchMean:
         graph = Graph()
         q, dq, ddq, *turn = (graph.inputs(n) for _ in range(5))
         links = links_of(arm.arm.geometry, step, arm.arm.parameters, change)
-        first = torque(*links, q, dq, ddq, turn)
+        first = torque(links, q, dq, ddq, turn)
         torques: list[Number] = [each.value + each.change for each in first]
         loads = [each.value for each in first] if self._drive.needs_bodies else []
         if arm.others is not None:
@@ -50,7 +50,7 @@ class BatchMean:
                 none = np.zeros_like(other.parameters)
                 geometry = replace(other.geometry, gravity=arm.arm.alternatives[0].geometry.gravity)
                 links = links_of(geometry, np.zeros(0), other.parameters, none)
-                alone = torque(*links, q, dq, ddq, turn)
+                alone = torque(links, q, dq, ddq, turn)
                 torques = [one + each.value * share for one, each in zip(torques, alone, strict=True)]
                 self._own += share * np.concatenate([other.rotor[:, None], other.friction], axis=1).T
         learnt = np.zeros(0) if residual is None else posterior.slopes[posterior.basis.rows(residual)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -43,7 +42,7 @@ class Description:
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A serial arm with a fixed base and n moving bodies, in the order of the data's joints."""
+    """Serial arms on one fixed base, with n moving bodies, in the order of the data's joints."""
 
     name: str
     urdf: str
@@ -55,7 +54,7 @@ class RigidBody:
     matched: Matching
     """How the joints were matched."""
     model: Any = field(repr=False, compare=False)
-    """Pinocchio's model, with every other joint locked at neutral."""
+    """Pinocchio's model, with every other joint locked at neutral: its arms one after another."""
     fixed_joints: tuple[str, ...] = ()
     """The URDF's joints that move, but are locked because the data lack them."""
 
@@ -136,9 +135,14 @@ class RigidBody:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Return the index of each joint of the data in Pinocchio's chain, which runs from base to tip: (n,)."""
+        """Return the index of each joint of the data in Pinocchio's model, from base to tip, arm after arm: (n,)."""
         place = {name: index for index, name in enumerate(tuple(self.model.names)[1:])}
         return tuple(place[name] for name in self.urdf_joints)
+
+    @property
+    def roots(self) -> tuple[int, ...]:
+        """Return the index of each arm's first joint in Pinocchio's model."""
+        return tuple(index for index, parent in enumerate(tuple(self.model.parents)[1:]) if parent == 0)
 
     def parameters(self) -> Array:
         """Return the inertial parameters of the body that each joint moves, locked links included: (n, 10)."""
@@ -146,8 +150,9 @@ class RigidBody:
         return np.array(chain)[list(self.order)]
 
     def length(self) -> float:
-        """Return the characteristic length, m: the mean distance from one joint to the next."""
-        steps = [float(np.linalg.norm(place.translation)) for place in tuple(self.model.jointPlacements)[2:]]
+        """Return the characteristic length, m: the mean distance from one joint of an arm to the next."""
+        pairs = zip(tuple(self.model.jointPlacements)[1:], tuple(self.model.parents)[1:], strict=True)
+        steps = [float(np.linalg.norm(place.translation)) for place, parent in pairs if parent]
         mean = float(np.mean(steps)) if steps else 0.0
         return mean if mean > 0.01 else 0.3  # shorter distances do not measure the links
 
@@ -198,7 +203,7 @@ def _parse(plain: str) -> Any:
 
 
 def _reduce(full: Any, free: Sequence[str]) -> Any:
-    """Return the model with every joint locked but `free`, which have to form one chain from base to tip."""
+    """Return the model with every joint locked but `free`, which have to form chains from the base to their tips."""
     pin = pinocchio()
     locked = [full.getJointId(name) for name in tuple(full.names)[1:] if name not in free]
     try:
@@ -215,18 +220,11 @@ def _reduce(full: Any, free: Sequence[str]) -> Any:
 
 
 def _check_chain(names: Sequence[str], parents: Sequence[int]) -> None:
-    """Raise UrdfError unless each joint follows the one before it. parents: index of the joint before, -1: the base."""
-    branches = [index for index, parent in enumerate(parents) if parent != index - 1]
-    if not branches:
-        return
-    first = branches[0]
-    before = "the base" if parents[first] < 0 else repr(names[parents[first]])
-    message = f"the joints branch: {names[first]!r} follows {before}, not {names[first - 1]!r}"
-    if any(parents[index] >= 0 for index in branches):
-        raise UrdfError(f"{message}; expected one serial chain from base to tip")
-    ends = (0, *branches, len(names))
-    arms = [", ".join(names[start:end]) for start, end in pairwise(ends)]
-    raise UrdfError(
-        f"{message}. These {len(arms)} arms share only the fixed base: the torque of each depends on its own motion "
-        f"alone. Train a model for each, from data with its joints only (`joints` of an upload): {'; '.join(arms)}"
-    )
+    """Raise UrdfError for a branch above the base. parents: index of the joint before each joint, -1: the base."""
+    for index, parent in enumerate(parents):
+        if parent not in (-1, index - 1):
+            raise UrdfError(
+                f"the joints branch: {names[index]!r} follows {names[parent]!r}, not {names[index - 1]!r}; expected "
+                "serial arms that share only the fixed base. Leave out the joints of all branches but one (`joints` of "
+                "an upload)"
+            )

@@ -183,7 +183,8 @@ class EstimatorComparison:
         if self._is_explained():
             return
         self.entries[LOCAL] = self._enter(LOCAL, LOCAL, self.learnt) if self.learnt else self.entries[RIGID]
-        self.entries[CHAIN] = self._enter(CHAIN, CHAIN, self.learnt)
+        if self.learnt is None or len(self.learnt.arm.geometry.roots) == 1:  # several arms are no serial chain
+            self.entries[CHAIN] = self._enter(CHAIN, CHAIN, self.learnt)
         if self.learnt and mode_of(self.work.task) == "learn" and self._chain_leads():
             entry, learnt = self._rigid("again", self.learnt)
             if learnt and entry.density > self.entries[RIGID].density:
@@ -198,7 +199,7 @@ class EstimatorComparison:
         if len(self.entries) == 1:
             return RIGID, "it explains the held-out torque within the sensor noise, so no other estimator was trained"
         # the simplest first: an estimator with an arm has smaller errors away from the data
-        answers = {name: self.entries[name].answer for name in (RIGID, LOCAL, CHAIN)}
+        answers = {name: self.entries[name].answer for name in (RIGID, LOCAL, CHAIN) if name in self.entries}
         local = self.entries[LOCAL].model
         if local is None or not corrected_joints(local.fit):
             del answers[LOCAL]
@@ -262,7 +263,7 @@ class EstimatorComparison:
 
     def _chain_leads(self) -> bool:
         """Return whether the chain predicts most joints better than the arm, beyond chance."""
-        arm, chain = self.entries[RIGID].answer, self.entries[CHAIN].answer
+        arm, chain = self.entries[RIGID].answer, self.entries[CHAIN].answer if CHAIN in self.entries else None
         if arm is None or chain is None:
             return False
         nlpd = compare(self.held.samples, arm, chain).nlpd

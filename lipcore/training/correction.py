@@ -15,9 +15,10 @@ import numpy as np
 from lipcore.data import metrics
 from lipcore.data.independence import thinned_weights
 from lipcore.data.metrics import LEVEL, quantile
-from lipcore.data.motion import spaced_rows
+from lipcore.data.motion import Indices, spaced_rows
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S, SplitRows, apply_guard
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.residual import JointResidual, ResidualKernel, residual_inputs
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.conformal import Conformal, conformal_of
@@ -104,7 +105,7 @@ def correct(
         own = thinned_weights(used.t[some])
         parts = max(OPTIONS.blocks, round(float(weights.sum()) / OPTIONS.part_weight))
         part = np.arange(len(some)) * parts // len(some)
-        shapes = fit_shapes(inputs[some], left[some], own, part, begin)
+        shapes = fit_shapes(inputs[some], left[some], own, part, begin, _arm_of(arm))
         candidates = spaced_rows(len(used), OPTIONS.max_candidates)
         for j, shape in enumerate(shapes):
             if shape.gain < lengthscales.OPTIONS.min_gain_nats and begin[j] is None:
@@ -136,6 +137,11 @@ def relearn_correction(arm: CompactPosterior, samples: Samples, before: Residual
         sums.append(np.zeros((0, 0)) if learnt is None else learnt[1])
     unknown = np.ones(len(noise))
     return Correction(ResidualKernel(found), noise, block_diagonal(sums), unknown, unknown, None)
+
+
+def _arm_of(posterior: CompactPosterior) -> Indices | None:
+    arms = [each.arm for each in posterior.basis.linear if isinstance(each, ArmKernel)]
+    return arms[0].arm_of if arms else None
 
 
 def _used_rows(samples: Samples, max_rows: float = np.inf) -> Samples:

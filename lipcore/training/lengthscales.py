@@ -55,6 +55,8 @@ class LengthscaleOptions:
 
 
 OPTIONS = LengthscaleOptions()
+UNUSED = 1e300
+"""Lengthscale of an input that a residual does not depend on: derivatives by it are zero."""
 
 
 @dataclass(frozen=True)
@@ -72,25 +74,37 @@ class Shape:
 
 
 def fit_shapes(
-    inputs: Array, residual: Array, weights: Array, block: Indices, begin: Sequence[Array | None]
+    inputs: Array,
+    residual: Array,
+    weights: Array,
+    block: Indices,
+    begin: Sequence[Array | None],
+    arm_of: Indices | None = None,
 ) -> list[Shape]:
     """Return the most likely hyperparameters of each joint, given N samples.
 
-    inputs: (N, D); residual: (N, n) N·m; weights: (N,), see `data.independence.recording_weights`; block: (N,), part of
-    the recording; neighbours are of another one; begin: (n,), lengthscales of an earlier fit, (D,) each; one search
-    improves them.
+    inputs: `residual_inputs`, (N, 4 n); residual: (N, n) N·m; weights: (N,), see
+    `data.independence.recording_weights`; block: (N,), part of the recording; neighbours are of another one; begin:
+    (n,), lengthscales of an earlier fit, (4 n,) each; one search improves them; arm_of: (n,), arm of each joint, all of
+    one if None. A residual does not depend on other arms.
     """
     order = np.random.default_rng(0).permutation(len(inputs))
-    spread = np.maximum(inputs.std(axis=0), 1e-9) * np.sqrt(inputs.shape[1])
-    search = _Search(inputs[order] / spread, weights[order], block[order])
-    out = []
+    arms = np.zeros(residual.shape[1], np.int64) if arm_of is None else arm_of
+    width, out = np.maximum(inputs.std(axis=0), 1e-9), []
     with threadpool_limits(1):  # idle threads of BLAS would wait in a loop
         for joint, column in enumerate(residual[order].T):
+            own = np.flatnonzero(arms == arms[joint])
+            used = np.flatnonzero(np.tile(arms == arms[joint], inputs.shape[1] // len(arms)))
+            spread = width[used] * np.sqrt(len(used))
+            search = _Search(np.ascontiguousarray(inputs[order][:, used] / spread), weights[order], block[order])
             power, before = float(np.mean(column**2)) or 1.0, begin[joint]
-            starts = _starts(joint, residual.shape[1]) if before is None else [np.log(before / spread)]
+            place = int(np.searchsorted(own, joint))
+            starts = _starts(place, len(own)) if before is None else [np.log(before[used] / spread)]
             logs, gain = search.fit(column / np.sqrt(power), starts)
             variance, noise = (power * np.exp(logs[-2:])).tolist()
-            out.append(Shape(np.exp(logs[:-2]) * spread, variance, noise, gain))
+            lengthscales = np.full(inputs.shape[1], UNUSED)
+            lengthscales[used] = np.exp(logs[:-2]) * spread
+            out.append(Shape(lengthscales, variance, noise, gain))
     return out
 
 

@@ -89,6 +89,8 @@ def print_version(version: Version) -> None:
         echo(f"  {counted(version.fit['samples_given'], 'sample')}, {round(independent):,} effective")
     if version.conformal is not None:
         _print_guarantee(version.conformal)
+    if (arms := version.fit.get("arms")) is not None:
+        echo(f"  {arms} arms on one base, independent of each other")
     if (fixed := version.fit.get("fixed_joints")) is not None:
         echo(f"  fixed at zero, as the data lack them: {fixed}")
     print_of_joints(version)

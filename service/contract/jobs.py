@@ -48,6 +48,12 @@ class Options(RequestBody):
         description="For rigid bodies, the geometry of the joint axes: `learn` from torque alone, `calibrate` around "
         "the robot's URDF or `base`, or `fixed` to it; `auto`: calibrate if there is one, else learn",
     )
+    arms: str = Field(
+        _DEFAULTS.arms,
+        max_length=400,
+        description="For rigid bodies without a robot: the number of joints of each of several arms on one fixed base, "
+        "such as `7,7`, from base to tip, arm after arm in the order of the data. A robot's URDF has its arms itself",
+    )
     search_seconds: float = Field(
         _DEFAULTS.search_seconds,
         gt=0,

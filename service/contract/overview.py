@@ -22,6 +22,7 @@ class SketchedJoint(BaseModel):
     rotation: list[Three] = Field(description="Rotation of the joint frame at position zero, 3 × 3")
     translation: Three = Field(description="Translation of the joint frame, m")
     axis: Three = Field(description="Joint axis in the joint frame")
+    root: bool = Field(description="Whether the joint is the first of an arm, with its frame in that of the base")
     mass: float = Field(description="Mass of the link that the joint moves, kg")
     centre: Three = Field(description="Centre of mass of this link in the joint frame, m")
 

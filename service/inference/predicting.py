@@ -152,15 +152,17 @@ def check_torque(given: bool, needed: bool, users: str, place: str) -> None:
 def model_with_payload(served: ServedModel, payload: Payload | None) -> TorqueModel:
     """Return a version's model with this payload, or its default model if None.
 
-    Raise InvalidRequestError if the version has no rigid bodies or the payload is not a possible body.
+    Raise InvalidRequestError if the version has no rigid bodies, or several arms, or the payload is no possible body.
     """
     if payload is None:
         return served.default_model
     try:
         return served.declared_payloads.model(payload.numbers)
-    except NoArmError:
-        expected = f"no payload, or a model of estimator {' or '.join(ROBOT_ESTIMATORS)}"
+    except NoArmError as error:
+        expected = f"no payload, or a model of one arm, of estimator {' or '.join(ROBOT_ESTIMATORS)}"
         message = f"`payload` needs a model with rigid bodies; estimator {served.model.estimator.name} has none."
+        if served.model.arms:
+            message = f"`payload` is not possible: {error}."
         raise invalid_request("payload", "given", expected, message) from None
     except ValueError as error:  # the message starts with a payload field and ends with what was expected
         name, text = str(error).partition(" ")[0], str(error).rpartition("expected ")[2]

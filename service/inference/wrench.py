@@ -30,10 +30,11 @@ def wrench(
     known = served.model
     if not has_wrench(known):
         message = (
-            f"`{model}` has no wrench: train it with a URDF, the option geometry `fixed` or `calibrate`, and at least "
-            "6 joints."
+            f"`{model}` has no wrench: train it with a URDF, the option geometry `fixed` or `calibrate`, and one arm "
+            "of at least 6 joints."
         )
-        raise invalid_request("model", model, "a model with the geometry of a URDF and at least 6 joints", message)
+        expected = "a model of one arm with the geometry of a URDF and at least 6 joints"
+        raise invalid_request("model", model, expected, message)
     parts = check_shapes(request, known)
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), request.q.ndim == 1)
     count = query.values.shape[1]

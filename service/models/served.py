@@ -67,8 +67,8 @@ class ServedModel:
 
     @cached_property
     def carrier(self) -> Carrier | None:
-        """The carrier that adds payloads to the model; None if the model has no arm."""
-        return None if self.model.arm is None else self.declared_payloads.carrier
+        """The carrier that adds payloads to the model; None if the model has no arm, or several."""
+        return self.declared_payloads.carrier if self.model.arms == 1 else None
 
     @cached_property
     def declared_payloads(self) -> DeclaredPayloads:

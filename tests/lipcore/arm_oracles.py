@@ -31,14 +31,14 @@ def as_robot(geometry: Geometry, bodies: np.ndarray) -> Robot:
     for j, kind in enumerate(geometry.joint_types):
         make = pin.JointModelPrismaticUnaligned if kind == "prismatic" else pin.JointModelRevoluteUnaligned
         place = pin.SE3(geometry.rotation[j], geometry.translation[j])
-        last = model.addJoint(last, make(geometry.axis[j]), place, f"joint{j + 1}")
+        last = model.addJoint(0 if j in geometry.roots else last, make(geometry.axis[j]), place, f"joint{j + 1}")
         model.appendBodyToJoint(last, pin.Inertia.FromDynamicParameters(bodies[j]), pin.SE3.Identity())
     reach = np.where(np.array(geometry.joint_types) == "prismatic", 0.4, 2.5)
     return Robot("arm", model, tuple(model.names)[1:], geometry.joint_types, -reach, reach, np.full(n, 4.0))
 
 
 def arm(kinds: str, seed: int, gravity: bool = True) -> tuple[Geometry, np.ndarray, Robot]:
-    """Return geometry, bodies and Pinocchio's model of a random arm of joints `R` and `P`."""
+    """Return geometry, bodies and Pinocchio's model of random arms, see `random_geometry`."""
     geometry, bodies = random_geometry(kinds, seed, gravity), random_bodies(len(kinds), seed)
     return geometry, bodies, as_robot(geometry, bodies)
 
@@ -52,8 +52,14 @@ def train_from_geometry(
     geometry: Geometry, robot: Robot, samples: Samples, options: FitOptions, estimator: str = "rigid-body"
 ) -> TorqueModel:
     """Train from the true geometry, which saves the seconds of a search."""
-    task = Task(samples, robot.joint_types, options)
+    task = Task(samples, robot.joint_types, replace(options, arms=arms_of(geometry)))
     return fit_estimator(task, estimator, learn(task, begin=(geometry.canonical(),)))
+
+
+def arms_of(geometry: Geometry) -> str:
+    """Return the option `arms` of a fit for a geometry."""
+    sizes = np.diff([*geometry.roots, geometry.n_joints])
+    return ",".join(map(str, sizes)) if len(sizes) > 1 else ""
 
 
 def record_motion(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:
@@ -104,6 +110,8 @@ def energies(geometry: Geometry, bodies: np.ndarray, step: Tensor, q: Tensor, dq
         turn, origin, used = torch.eye(3, dtype=at.dtype), torch.zeros(3, dtype=at.dtype), 0
         turns, origins = [], []
         for j, (kind, count) in enumerate(zip(geometry.joint_types, geometry.screws, strict=True)):
+            if j in geometry.roots:
+                turn, origin = torch.eye(3, dtype=at.dtype), torch.zeros(3, dtype=at.dtype)
             rotation, place, axis = map(tensor, (geometry.rotation[j], geometry.translation[j], geometry.axis[j]))
             across, part = tensor(geometry.across[j]), step[used : used + count]
             used += count

@@ -10,16 +10,17 @@ from lipcore.robots.urdf import RigidBody
 
 
 def random_geometry(kinds: str, seed: int, gravity: bool = True) -> Geometry:
-    """Return an arm of joints `R` and `P` with no aligned axes, on a tilted base."""
+    """Return joints `R` and `P` with no aligned axes, on a tilted base; lower case: the first joint of another arm."""
     rng = np.random.default_rng(seed)
     n = len(kinds)
     axis, down = rng.standard_normal((n, 3)), rng.standard_normal(3)
     return Geometry(
-        tuple("prismatic" if kind == "P" else "revolute" for kind in kinds),
+        tuple("prismatic" if kind in "Pp" else "revolute" for kind in kinds),
         np.array([rotation_of(rng.uniform(-2, 2, 3)) for _ in kinds]),
         rng.normal(0, 0.4, (n, 3)),
         axis / np.linalg.norm(axis, axis=1, keepdims=True),
         down * (9.81 / np.linalg.norm(down) if gravity else 0.0),
+        (0, *(joint for joint, kind in enumerate(kinds) if kind.islower())),
     )
 
 
@@ -64,6 +65,7 @@ def parameters(geometry: Geometry, bodies: np.ndarray, joint_names: Sequence[str
             "turn_std": [0.001, 0.002][: counts[place]],
             "shift_std": [0.001, 0.004][: max(counts[place] - 2, 0)],
             "undetermined": ["shift 2"] if place == n - 1 and counts[place] == 4 else [],
+            **({"root": True} if place and place in geometry.roots else {}),
         }
         for place in range(n)
     ]

@@ -22,6 +22,7 @@ from lipcore.kernels.fast.arm_recursion import (
     PARAMETERS,
     PSI,
     PSI2,
+    ROOT,
     SCREW,
     SCREWS,
     SPARE,
@@ -44,6 +45,7 @@ from lipcore.kernels.fast.arm_recursion import (
     dot,
     momentum,
     moving_cross,
+    row_before,
     sum_momenta,
 )
 from lipcore.kernels.fast.compile import compiled
@@ -63,18 +65,18 @@ def masses(constants: Array, order: Indices, work: Array, table: Array, out: Arr
     n = constants.shape[0]
     out[: PARAMETERS * n] = 0.0
     for j in range(n):
-        link_masses(order, work, j, table, out, PARAMETERS * order[j])
+        link_masses(constants, order, work, j, table, out, PARAMETERS * order[j])
 
 
 @compiled
-def link_masses(order: Indices, work: Array, j: int, table: Array, out: Array, first: int) -> None:
+def link_masses(constants: Array, order: Indices, work: Array, j: int, table: Array, out: Array, first: int) -> None:
     """Write ∂τ/∂π of the body at place j of the chain after `kinematics`, to ten rows of `out` from `first` on.
 
-    Columns of joints after place j are not written.
+    Columns of joints after place j, and of other arms, are not written.
     """
     row = work[j]
     _link_table(row, table)
-    for i in range(j + 1):
+    for i in range(int(constants[j, ROOT]), j + 1):
         joint, screw = work[i], order[i]
         # the screw of joint i in the frame of link j
         for c in range(3):
@@ -149,7 +151,7 @@ def shapes(constants: Array, order: Indices, work: Array, out: Array) -> None:
         add_cross(row, SPARE + 1, row, S + 3, row, G)
     at = 0
     for j in range(n):
-        row, before = work[j], work[j - 1 if j else n]
+        row, before = work[j], work[row_before(constants, j)]
         for number in range(int(constants[j, SCREWS])):
             _screw(row, number)
             moving_cross(before, V, row, SCREW, row, PSI)
@@ -163,10 +165,13 @@ def shapes(constants: Array, order: Indices, work: Array, out: Array) -> None:
                 row[SPARE + 1 + c] = 2 * row[P + c]
             add_cross(row, PSI, row, SPARE + 1, row, FORCE + 3)
             add_force_cross(row, SCREW, row, F, row, FORCE)
-            for i in range(j):
-                out[at, order[i]] = dot(work[i], S, row, FORCE, 6)
-            for i in range(j, n):
-                out[at, order[i]] = dot(work[i], D, row, PSI2, 6) + dot(work[i], G, row, PSI, 3)
+            for i in range(n):
+                if constants[i, ROOT] != constants[j, ROOT]:
+                    out[at, order[i]] = 0.0
+                elif i < j:
+                    out[at, order[i]] = dot(work[i], S, row, FORCE, 6)
+                else:
+                    out[at, order[i]] = dot(work[i], D, row, PSI2, 6) + dot(work[i], G, row, PSI, 3)
             at += 1
 
 
@@ -222,9 +227,9 @@ def energies(
     if out.shape[1] == at:
         return
     bodies(constants, parameters, work)
-    sum_momenta(parameters, work)
+    sum_momenta(constants, parameters, work)
     for j in range(n):
-        row, before = work[j], work[j - 1 if j else n]
+        row, before = work[j], work[row_before(constants, j)]
         for number in range(int(constants[j, SCREWS])):
             _screw(row, number)
             moving_cross(before, V, row, SCREW, row, PSI)

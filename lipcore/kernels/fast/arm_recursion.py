@@ -1,8 +1,9 @@
-"""Motion and forces of a serial arm of rigid bodies: recursive Newton–Euler, docs/method.md (14).
+"""Motion and forces of serial arms of rigid bodies: recursive Newton–Euler, docs/method.md (14).
 
 Coordinates are those of the world. All spatial vectors are about the base's origin: motions (ω, v), forces (n, f). S_i
 is the screw of joint i. V_i and A_i are the velocity and acceleration of body i; gravity is an acceleration of the
-base. All bodies from i to the tip together have mass m, first moment h, inertia Ī, momentum P = (L, p) and force F:
+base. All bodies from i to the tip of its arm together have mass m, first moment h, inertia Ī, momentum P = (L, p) and
+force F:
 
     τ_i = S_iᵀ F_i                                   F = Σ I A + V ×* I V
 """
@@ -18,10 +19,11 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 PARAMETERS = 10  # per body: mass, first moment (3), inertia xx, xy, yy, xz, yz, zz, about its joint's frame
-CONSTANTS = 48  # per joint: three 3×3 matrices of its rotation, its place, its axis, two vectors across it, its type
+CONSTANTS = 48  # per joint: three 3×3 matrices of its rotation, its place, its axis, two vectors across it, its type,
+# the number of its steps, and the first joint of its arm
 
 # offsets in a joint's row of `constants`
-TURN, PLACE, AXIS, ACROSS, KIND, SCREWS = 0, 27, 30, 33, 39, 40
+TURN, PLACE, AXIS, ACROSS, KIND, SCREWS, ROOT = 0, 27, 30, 33, 39, 40, 41
 # offsets in a joint's row of `work`
 R, ORIGIN, S, E, V, A, MASS, H, INERTIA, P, N, F, D, G = 0, 9, 12, 18, 24, 30, 36, 37, 40, 49, 52, 61, 67, 73
 WORK = 128
@@ -75,6 +77,18 @@ def momentum(row: Array, motion: Array, i: int, out: Array, k: int) -> None:
     add_cross(motion, i, row, H, out, k + 3)
 
 
+@inlined
+def row_before(constants: Array, j: int) -> int:
+    """Return the row of `work` of the body before joint j; the base is in the last row."""
+    return constants.shape[0] if constants[j, ROOT] == j else j - 1
+
+
+@inlined
+def is_carrying(constants: Array, j: int) -> bool:
+    """Return whether joint j + 1 is of the same arm."""
+    return j + 1 < constants.shape[0] and constants[j + 1, ROOT] != j + 1
+
+
 @compiled
 def kinematics(constants: Array, gravity: Array, motion: Array, order: Indices, work: Array) -> None:
     """Write R, ORIGIN, S, E, V and A of each joint, base to tip.
@@ -90,7 +104,7 @@ def kinematics(constants: Array, gravity: Array, motion: Array, order: Indices, 
     for c in range(3):
         base[A + 3 + c] = -gravity[c]
     for j in range(n):
-        fixed, row, before = constants[j], work[j], work[j - 1 if j else n]
+        fixed, row, before = constants[j], work[j], work[row_before(constants, j)]
         q, dq, ddq = motion[0, order[j]], motion[1, order[j]], motion[2, order[j]]
         revolute = fixed[KIND] == 0.0
         sin, cos = (np.sin(q), np.cos(q)) if revolute else (0.0, 1.0)
@@ -122,7 +136,7 @@ def kinematics(constants: Array, gravity: Array, motion: Array, order: Indices, 
 
 @compiled
 def bodies(constants: Array, parameters: Array, work: Array) -> None:
-    """Write MASS, H, INERTIA, P, N and F of each joint after `kinematics`: the sums from its body to the tip.
+    """Write MASS, H, INERTIA, P, N and F of each joint after `kinematics`: sums from its body to its arm's tip.
 
     parameters: (n, 10) of the bodies, base to tip.
     """
@@ -137,7 +151,7 @@ def bodies(constants: Array, parameters: Array, work: Array) -> None:
         momentum(row, row, A, row, F)
         add_force_cross(row, V, spare, 0, row, F)
         _coriolis(row)
-        if j < n - 1:
+        if is_carrying(constants, j):
             for c in range(MASS, F + 6):
                 row[c] += work[j + 1, c]
 
@@ -191,8 +205,8 @@ def torques(order: Indices, work: Array, out: Array) -> None:
 
 
 @compiled
-def sum_momenta(parameters: Array, work: Array) -> None:
-    """Write D of each joint, the momentum (L, p) of all bodies from its own to the tip.
+def sum_momenta(constants: Array, parameters: Array, work: Array) -> None:
+    """Write D of each joint, the momentum (L, p) of all bodies from its own to the tip of its arm.
 
     The sums of masses are preserved.
     """
@@ -203,6 +217,6 @@ def sum_momenta(parameters: Array, work: Array) -> None:
         _place_body(row, parameters[j])
         momentum(row, row, V, row, D)
         row[MASS : INERTIA + 9] = kept
-        if j < n - 1:
+        if is_carrying(constants, j):
             for c in range(6):
                 row[D + c] += work[j + 1, D + c]

@@ -15,7 +15,7 @@ def payload_size(n: int) -> int:
 
 @brief
 def payload_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
-    """Write the features of one query, ∂τ/∂π of the last link, (10, n).
+    """Write the features of one query, ∂τ/∂π of the last link, (10, n); zero for joints of other arms.
 
     memory: `Memory` of the geometry's constants and gravity, with `payload_size` elements to work in.
     """
@@ -23,8 +23,10 @@ def payload_query(memory: Array, order: Indices, motion: Array, out: Array) -> N
     gravity = n * CONSTANTS
     first = gravity + 3
     work = numbers(memory, first, (n + 1, WORK))
-    kinematics(numbers(memory, 0, (n, CONSTANTS)), memory[gravity:first], motion, order, work)
-    link_masses(order, work, n - 1, memory[first + (n + 1) * WORK :], out, 0)
+    constants = numbers(memory, 0, (n, CONSTANTS))
+    kinematics(constants, memory[gravity:first], motion, order, work)
+    out[:PARAMETERS] = 0.0
+    link_masses(constants, order, work, n - 1, memory[first + (n + 1) * WORK :], out, 0)
 
 
 @compiled

@@ -83,11 +83,12 @@ def arrange_joints(
         left_out += tuple(joint for joint in chosen if joint.index not in {each.index for each in kept})
     if not 1 <= len(kept) <= max_joints:
         raise invalid_data("joints", len(kept), f"1 to {max_joints}")
-    if arms := _find_arms([joint.name for joint in kept]):
+    if robot is None and (arms := _find_arms([joint.name for joint in kept])):
         several = " and ".join(f"{each[0]} to {each[-1]}" for each in arms[:_MAX_LISTED])
         notes.append(
-            f"{WARNING}By their names, these are the joints of {len(arms)} arms: {several}. Learn each arm alone: "
-            f"joints={','.join(arms[0])}."
+            f"{WARNING}By their names, these are the joints of {len(arms)} arms: {several}. "
+            "To learn them in one model, set `robot` to a URDF with all arms, or train with the option arms="
+            f"{','.join(str(len(each)) for each in arms)}. To learn one alone: joints={','.join(arms[0])}."
         )
     if robot is None and _is_alphabetical(kept):
         notes.append(

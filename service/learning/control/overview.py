@@ -85,12 +85,13 @@ def sketch_arm(manifest: dict[str, Any]) -> ArmSketch | None:
     if "inertia" not in parameters:
         return None
     geometry, bodies = parameters["geometry"], parameters["inertia"]["bodies"]
-    joints = []
+    joints = list[SketchedJoint]()
     for joint, at in zip(geometry["order"], geometry["joints"], strict=True):
         body = bodies[joint]["plausible"]
         joints.append(
             SketchedJoint(
                 joint=joint,
+                root=not joints or at.get("root", False),
                 mass=body["mass"],
                 centre=[moment / body["mass"] for moment in body["first_moment"]],
                 **{name: at[name] for name in ("type", "rotation", "translation", "axis")},

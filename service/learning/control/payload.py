@@ -11,7 +11,7 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.model.body import Body
-from lipcore.model.payload import Carrier
+from lipcore.model.payload import ONE_ARM, Carrier
 from lipcore.online.payload.bodies import BELOW, DIAGONAL
 from lipcore.online.payload.estimate import Estimate
 from lipcore.online.payload.holding import PayloadTracker
@@ -56,7 +56,7 @@ def read_payloads(learners: Learners, model: str) -> Payloads:
         default = None if held is None else _payload_body(held.estimate, tip)
     reason = None
     if carrier is None:
-        reason = f"estimator {served.model.estimator.name} has no arm: train with rigid-body or auto"
+        reason = _reason_without_carrier(served)
     elif not watched:
         reason = "the learning option `payloads` is off"
     return Payloads(
@@ -100,12 +100,17 @@ def remove(learners: Learners, model: str, stream_id: str | None) -> Payloads:
     return _declare(learners, model, stream_id, None)
 
 
+def _reason_without_carrier(served: ServedModel) -> str:
+    if served.model.arms:
+        return f"it has {served.model.arms} arms, {ONE_ARM}"
+    return f"estimator {served.model.estimator.name} has no arm: train with rigid-body or auto"
+
+
 def _declare(learners: Learners, model: str, stream_id: str | None, known: dict[str, Any] | None) -> Payloads:
     served = learners.loaded.get(model, None)
     if served.carrier is None:
         raise ConflictError(
-            f"version {served.version} of model {model!r}, of estimator {served.model.estimator.name}, has no arm, so "
-            "it cannot have a payload: train with rigid-body or auto"
+            f"version {served.version} of model {model!r} cannot have a payload: {_reason_without_carrier(served)}"
         )
     monitor = learners.monitor(model)
     with learners.turn(model):

@@ -117,6 +117,7 @@ def train_with_alternatives_and_drive() -> TorqueModel:
 MODELS = {
     "panda": lambda: load(PANDA),
     "prismatic": lambda: train_arm("RPR", 51),
+    "two arms": lambda: with_drive(train_arm("RRpRR", 52), *DRIVE_KINDS),
     "prismatic first": lambda: train_arm("PRR", 50),
     "alternatives": train_with_alternatives,
     "fixed, from its tip": lambda: reversed_pendulum_model("fixed", OPTIONS),

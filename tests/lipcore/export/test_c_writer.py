@@ -60,7 +60,7 @@ def evaluate_exactly(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", few(MODELS, kept=lambda name: name == "panda"))
+@pytest.mark.parametrize("name", few(MODELS, kept=lambda name: name in ("panda", "two arms")))
 def test_compiled_numbers_match_the_model(name: str, tmp_path: Path) -> None:
     model = MODELS[name]()
     path = compile_library(c_files(model, ORIGIN), tmp_path)

@@ -65,6 +65,7 @@ ARMS = {
     "prismatic": lambda: arm_of_kinds("RPPRR"),
     "learnt geometry": lambda: arm_of_kinds("RRRRRRR"),
     "without gravity": lambda: arm_of_kinds("PRR", gravity=False),
+    "two arms": lambda: arm_of_kinds("RPRrRP"),
 }
 
 

@@ -19,7 +19,7 @@ from tests.lipcore.arms import random_geometry
 from tests.lipcore.robots.test_urdf import joint, link
 from tests.lipcore.robots.test_urdf import robot as robot_of
 
-KINDS = ("R", "RPR", "PRR", "RRRR")
+KINDS = ("R", "RPR", "PRR", "RRRR", "RRpR")
 ROBOTS = ("double-pendulum", "panda", "kinova", "tiago")
 
 
@@ -63,7 +63,14 @@ def test_step_between_geometries_is_recovered(kinds: str, gravity: bool) -> None
 
 @pytest.mark.parametrize(
     ("kinds", "gravity", "screws"),
-    [("R", True, (2,)), ("R", False, (0,)), ("P", True, (2,)), ("RPR", True, (2, 2, 4)), ("PRR", False, (0, 4, 4))],
+    [
+        ("R", True, (2,)),
+        ("R", False, (0,)),
+        ("P", True, (2,)),
+        ("RPR", True, (2, 2, 4)),
+        ("PRR", False, (0, 4, 4)),
+        ("RRpR", True, (2, 4, 2, 4)),
+    ],
 )
 def test_number_of_identifiable_geometry_parameters(kinds: str, gravity: bool, screws: tuple[int, ...]) -> None:
     geometry = random_geometry(kinds, 3, gravity)
@@ -82,7 +89,7 @@ def test_canonical_arm_has_the_same_torques(kinds: str) -> None:
     assert unexplained_share(regressor(canonical, queries), torque) < 1e-10
     again = canonical.canonical()
     np.testing.assert_allclose(again.translation, canonical.translation, atol=1e-12)
-    assert not canonical.translation[0].any()
+    assert not canonical.translation[list(geometry.roots)].any()
     for j, kind in enumerate(canonical.joint_types):
         along = canonical.translation[j] @ canonical.rotation[j] @ canonical.axis[j]
         assert along == pytest.approx(0.0, abs=1e-12)
@@ -140,7 +147,7 @@ def test_invalid_geometry_is_rejected() -> None:
             Geometry(good.joint_types, **{**parts, name: value})
 
 
-CHAINS = ("RPR", "PRR", "RRP", "RRRR", "P", "R")
+CHAINS = ("RPR", "PRR", "RRP", "RRRR", "P", "R", "RPRrPr")
 TOLERANCE = 1e-10
 """Relative tolerance for rounding errors."""
 

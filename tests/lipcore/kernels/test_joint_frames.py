@@ -14,7 +14,7 @@ from tests.choosing import few
 from tests.lipcore.arm_oracles import arm, random_bodies, random_motions
 from tests.lipcore.kernels.test_graph import evaluate
 
-KINDS = ["RRRRRRR", "RPRPR", "PPR", "P", "R"]
+KINDS = ["RRRRRRR", "RPRPR", "PPR", "P", "R", "RPRrPR"]
 
 
 def turn_of(q: np.ndarray) -> np.ndarray:
@@ -34,7 +34,7 @@ def test_torques_are_those_of_pinocchio(kinds: str) -> None:
     frames = links_of(geometry, np.zeros(0), bodies, 0 * bodies)
     for q, dq, ddq in random_motions(len(kinds), 4):
         expected = pin.rnea(robot.model, robot.model.createData(), robot.configuration(q), dq, ddq)
-        found = [each.value for each in torque(*frames, q, dq, ddq, turn_of(q))]
+        found = [each.value for each in torque(frames, q, dq, ddq, turn_of(q))]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
@@ -48,7 +48,7 @@ def test_change_is_the_linear_one(kinds: str) -> None:
     loaded[-1] += in_own_frame(geometry, more)
     for motion in random_motions(len(kinds), 9):
         expected = linearised_torque(geometry, loaded + change, State(*motion), loaded, step)
-        found = [each.value + each.change for each in torque(*frames, *motion, turn_of(motion[0]), more)]
+        found = [each.value + each.change for each in torque(frames, *motion, turn_of(motion[0]), more)]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
@@ -61,7 +61,7 @@ def test_parallel_axes_need_no_common_normal() -> None:
     motion = State(q, dq, ddq)
     expected = linearised_torque(geometry, bodies, motion, bodies, np.zeros(geometry.size))
     frames = links_of(geometry, np.zeros(0), bodies, 0 * bodies)
-    found = [each.value for each in torque(*frames, q, dq, ddq, turn_of(q))]
+    found = [each.value for each in torque(frames, q, dq, ddq, turn_of(q))]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
@@ -69,7 +69,7 @@ def test_an_arm_of_seven_joints_needs_less_than_a_thousand_operations() -> None:
     geometry, bodies, _ = arm("RRRRRRR", 12)
     frames, graph = links_of(geometry, np.zeros(0), bodies, 0 * bodies), Graph()
     q, dq, ddq, *turn = (graph.inputs(7) for _ in range(5))
-    program = Program.of([each.value for each in torque(*frames, q, dq, ddq, turn)])
+    program = Program.of([each.value for each in torque(frames, q, dq, ddq, turn)])
     assert len(program.operations) < 1000
 
 

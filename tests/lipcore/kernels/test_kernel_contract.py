@@ -105,10 +105,14 @@ def mixture_features(kernel: MixtureKernel, arm: Arm, motion: Motion) -> Array:
     return np.stack([each - torques[0] for each in torques[1:]], axis=2) @ kernel.mixing
 
 
-def random_arm(joint_types: Sequence[str], others: int = 0) -> Arm:
-    """Return a random arm with another joint order in the data, and its alternatives."""
+def random_arm(joint_types: Sequence[str], others: int = 0, several: bool = False) -> Arm:
+    """Return a random arm with another joint order in the data, and its alternatives.
+
+    several: whether the last joint is an arm by itself.
+    """
     n, rng = len(joint_types), np.random.default_rng(1)
-    geometry = random_geometry("".join("P" if kind == "prismatic" else "R" for kind in joint_types), 2)
+    letters = "".join("P" if kind == "prismatic" else "R" for kind in joint_types)
+    geometry = random_geometry(letters[:-1] + letters[-1].lower() if several else letters, 2)
     units = 0.5 + rng.random(11 * n), rng.random(n), rng.normal(0, 0.1, geometry.size), np.full(geometry.size, 0.3)
     shares = np.array([0.5, 0.3, 0.2])
     alternatives = tuple(
@@ -136,13 +140,13 @@ def random_arm(joint_types: Sequence[str], others: int = 0) -> Arm:
     )
 
 
-def arm_case(joint_types: Sequence[str]) -> Case:
-    arm = random_arm(joint_types)
+def arm_case(joint_types: Sequence[str], several: bool = False) -> Case:
+    arm = random_arm(joint_types, several=several)
     return Case(ArmKernel(arm), [partial(arm_features, arm)], GEOMETRY_TOLERANCE)
 
 
-def mixture_case(joint_types: Sequence[str]) -> Case:
-    arm = random_arm(joint_types, others=2)
+def mixture_case(joint_types: Sequence[str], several: bool = False) -> Case:
+    arm = random_arm(joint_types, others=2, several=several)
     kernel = MixtureKernel(arm, arm.alternatives)
     return Case(kernel, [partial(mixture_features, kernel, arm)])
 
@@ -156,8 +160,8 @@ def arm_with_alternatives_case(joint_types: Sequence[str]) -> Case:
     )
 
 
-def payload_case(joint_types: Sequence[str]) -> Case:
-    arm = random_arm(joint_types)
+def payload_case(joint_types: Sequence[str], several: bool = False) -> Case:
+    arm = random_arm(joint_types, several=several)
     last = slice(10 * int(arm.order[-1]), 10 * int(arm.order[-1]) + 10)
 
     bodies = partial(derivatives_by_bodies, arm.geometry, arm.order)
@@ -195,6 +199,9 @@ CASES: dict[str, Callable[[Sequence[str]], Case]] = {
     "arm with alternatives": arm_with_alternatives_case,
     "mixture of arms": mixture_case,
     "payload": payload_case,
+    "two arms": partial(arm_case, several=True),
+    "mixture of two arms each": partial(mixture_case, several=True),
+    "payload of the last of two arms": partial(payload_case, several=True),
     "sum": sum_case,
 }
 JOINTS = {"RR": ("revolute", "revolute"), "RPR": ("revolute", "prismatic", "revolute")}

@@ -167,38 +167,34 @@ def test_uploaded_text_is_never_written_to_stderr(capfd: pytest.CaptureFixture[s
     assert "forged" not in "".join(capfd.readouterr())
 
 
-def test_branching_joints_are_rejected() -> None:
+def test_only_the_fixed_base_may_branch() -> None:
     text = robot(*AB, link("c"), joint("left", "a", "b"), joint("right", "a", "c"))
-    message = r"'right' follows the base, not 'left'.*Train a model for each, .*: left; right$"
-    with pytest.raises(UrdfError, match=message):
-        RigidBody.from_urdf(text, ("left", "right"), TWO_REVOLUTE)
+    both = RigidBody.from_urdf(text, ("left", "right"), TWO_REVOLUTE)
+    assert (both.roots, both.fixed_joints) == ((0, 1), ())
     one = RigidBody.from_urdf(text, ("left",), ("revolute",))
-    assert (one.n_joints, one.fixed_joints) == (1, ("right",))
+    assert (one.roots, one.fixed_joints) == ((0,), ("right",))
     torso = robot(*map(link, "abcd"), joint("lift", "a", "b"), joint("left", "b", "c"), joint("right", "b", "d"))
-    with pytest.raises(UrdfError, match=r"'right' follows 'lift', not 'left'; expected one serial chain"):
+    with pytest.raises(UrdfError, match=r"'right' follows 'lift', not 'left'; expected serial arms that share only"):
         RigidBody.from_urdf(torso, ("lift", "left", "right"), ("revolute",) * 3)
+    assert RigidBody.from_urdf(torso, ("left", "right"), TWO_REVOLUTE).roots == (0, 1)  # the lift stands still
 
 
-def test_two_arms_on_a_fixed_base_are_two_robots() -> None:
-    """What the error about branching joints recommends is exact: the arms do not affect each other."""
-    urdf, free = profile_urdf("baxter-left"), {side: ROBOTS[f"baxter-{side}"].free for side in ("left", "right")}
-    with pytest.raises(UrdfError, match=f"{', '.join(free['left'])}; {', '.join(free['right'])}$"):
-        RigidBody.from_urdf(urdf, (*free["left"], *free["right"]), ("revolute",) * 14)
-    full = pin.buildModelFromXML(urdf)
-    rng = np.random.default_rng(0)
+def test_two_arms_in_any_order_have_the_torques_of_pinocchio() -> None:
+    urdf, free = profile_urdf("baxter-left"), [ROBOTS[f"baxter-{side}"].free for side in ("left", "right")]
+    names = tuple(name for pair in zip(*free, strict=True) for name in pair)  # left, right, left, right, …
+    body = RigidBody.from_urdf(urdf, names, ("revolute",) * 14)
+    assert body.roots == (0, 7)
+    arm = arm_of_robot(body)
+    assert arm.arm_of.tolist() == [0, 1] * 7
+    full, rng = pin.buildModelFromXML(urdf), np.random.default_rng(0)
+    places = [full.joints[full.getJointId(name)] for name in names]
     q, (dq, ddq) = pin.neutral(full), np.zeros((2, full.nv))
-    for names in free.values():
-        for name in names:
-            place = full.joints[full.getJointId(name)]
-            q[place.idx_q], dq[place.idx_v], ddq[place.idx_v] = rng.normal(size=3)
-    tau = pin.rnea(full, full.createData(), q, dq, ddq)
-    for names in free.values():
-        alone = RigidBody.from_urdf(urdf, names, ("revolute",) * 7)
-        places = [full.joints[full.getJointId(name)] for name in names]
-        at = [place.idx_v for place in places]
-        own = pin.rnea(alone.model, alone.model.createData(), q[[place.idx_q for place in places]], dq[at], ddq[at])
-        assert alone.order == tuple(range(7))
-        np.testing.assert_allclose(own, tau[at], rtol=0, atol=1e-9)
+    motion = rng.normal(size=(1, 3, 14))
+    at = [place.idx_v for place in places]
+    q[[place.idx_q for place in places]], dq[at], ddq[at] = motion[0]
+    expected, found = pin.rnea(full, full.createData(), q, dq, ddq)[at], np.empty((1, 14))
+    arm_torques(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motion, found)
+    np.testing.assert_allclose(found[0], expected, rtol=0, atol=1e-9)
 
 
 def test_joints_without_data_are_fixed_and_named() -> None:
@@ -255,6 +251,23 @@ def test_energies_need_joints_from_base_to_tip() -> None:
         check_estimator("rigid-body+lip-chain", TWO_REVOLUTE, crossed)
     check_estimator("rigid-body", TWO_REVOLUTE, crossed)
     assert make_estimator("rigid-body", TWO_REVOLUTE, arm=arm_of_robot(crossed)).kernel.n_joints == 2
+    two = RigidBody.from_urdf(
+        robot(*AB, link("c"), joint("left", "a", "b"), joint("right", "a", "c")), ("left", "right"), TWO_REVOLUTE
+    )
+    with pytest.raises(JointMismatchError, match="needs one serial chain, but the robot has 2 arms: use rigid-body"):
+        check_estimator("rigid-body+lip-chain", TWO_REVOLUTE, two)
+
+
+@pytest.mark.parametrize(
+    ("arms", "estimator", "message"),
+    [("2,2", "auto", "arms is '2,2', expected numbers whose sum is 2"), ("1,1", "lip-chain", "and one of auto, rigid")],
+)
+def test_arms_without_a_robot_have_the_joints_of_the_data(arms: str, estimator: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_estimator(estimator, TWO_REVOLUTE, None, FitOptions(arms=arms))
+    check_estimator("auto", TWO_REVOLUTE, None, FitOptions(arms="1,1"))
+    with pytest.raises(ValueError, match="arms is '7;7', expected the number of joints of each"):
+        FitOptions(arms="7;7")
 
 
 def training_range(n: int) -> dict[str, dict[str, list[float]]]:

@@ -17,6 +17,7 @@ class SketchedJoint(Record, frozen=True, kw_only=True):
     rotation: Rotation of the joint frame at position zero, 3 × 3
     translation: Translation of the joint frame, m
     axis: Joint axis in the joint frame
+    root: Whether the joint is the first of an arm, with its frame in that of the base
     mass: Mass of the link that the joint moves, kg
     centre: Centre of mass of this link in the joint frame, m
     """
@@ -26,6 +27,7 @@ class SketchedJoint(Record, frozen=True, kw_only=True):
     rotation: list[list[float]]
     translation: list[float]
     axis: list[float]
+    root: bool
     mass: float
     centre: list[float]
 

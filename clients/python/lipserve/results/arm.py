@@ -162,6 +162,8 @@ def read_arm(version: models.Version) -> Arm | None:
 def _frames(shape: Mapping[str, Any]) -> Frames:
     turn, place, axes, places = np.eye(3), np.zeros(3), [], []
     for joint in shape["joints"]:
+        if joint.get("root"):
+            turn, place = np.eye(3), np.zeros(3)
         place, turn = place + turn @ array(joint["translation"]), turn @ array(joint["rotation"])
         axes.append(turn @ array(joint["axis"]))
         places.append(place)

@@ -4,7 +4,7 @@ import { css, withOpacity, jointColour } from "../../colours.js";
 import { shortNames } from "../../format.js";
 import { escapeMarkup, plot } from "../../plots.js";
 import { acrossPlane, cameraFor } from "./camera.js";
-import { add, frames, gravityAlignment, massCentres, scaled, times } from "./kinematics.js";
+import { add, armPaths, frames, gravityAlignment, massCentres, scaled, times } from "./kinematics.js";
 
 const AXIS = 0.12; // half-length of an axis, relative to the size of the arm
 const ROUND = 24; // vertices of a disc
@@ -81,14 +81,14 @@ class Arm {
 
   traces({ turned, masses }) {
     const { order } = this.geometry;
-    const links = [[0, 0, 0], ...turned.map((each) => each.origin)];
+    const links = armPaths(this.geometry.joints, turned.map((each) => each.origin)).flatMap((each) => [...each, null]);
     const arms = turned.flatMap(({ origin }, place) => [origin, masses[place], null]);
     const half = AXIS * this.size;
     const balls = order.map((joint) => this.masses[joint]);
     const most = Math.max(...balls);
     const open = (joint) => this.bodies[joint].undetermined?.includes("mass");
     return [
-      path(links, { name: "links", line: { color: css("line-strong"), width: 12 }, hoverinfo: "skip" }),
+      path(links, { name: "links", line: { color: css("line-strong"), width: 12 }, hoverinfo: "skip", connectgaps: false }),
       path(arms, { name: "to the masses", line: { color: css("muted"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
       ...turned.map(({ origin, axis }, place) => path([add(origin, scaled(axis, -half)), add(origin, scaled(axis, half))], {
         name: this.names[place], line: { color: jointColour(order[place]), width: order[place] === this.thick ? HIGHLIGHT_PX : 9 }, hovertemplate: `${escapeMarkup(this.names[place])}, ${this.geometry.joints[place].type}<extra></extra>`,

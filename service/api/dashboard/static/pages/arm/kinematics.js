@@ -1,9 +1,23 @@
-// Forward kinematics of an arm. Matrices are lists of rows; joints are ordered from base to tip.
+// Forward kinematics of arms on one base. Matrices are lists of rows; joints are ordered from base to tip, arm after arm.
+
+const BASE = [[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0, 0, 0]];
+
+/** Return the points of the links, one list for each arm, from the base on. points: of the joints; tips: of the ends behind the last joints, if any. */
+export function armPaths(joints, points, tips = null) {
+  const paths = [];
+  joints.forEach((joint, place) => {
+    if (joint.root || !place) paths.push([BASE[1]]);
+    paths.at(-1).push(points[place]);
+    if (tips && (place + 1 === joints.length || joints[place + 1].root)) paths.at(-1).push(tips[place]);
+  });
+  return paths;
+}
 
 /** Return the frames of all joints in the base frame at positions q (in the order of the data): [{rotation, origin, axis}, …]. */
 export function frames({ order, joints }, q) {
-  let [rotation, origin] = [[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0, 0, 0]];
+  let [rotation, origin] = BASE;
   return joints.map((joint, place) => {
+    if (joint.root) [rotation, origin] = BASE;
     origin = add(origin, times(rotation, joint.translation));
     rotation = product(rotation, joint.rotation);
     const position = q[order[place]];

@@ -2,7 +2,7 @@
 
 import { jointVar } from "../../colours.js";
 import { html, useEffect, useMemo, useRef, useState } from "../../preact.js";
-import { add, frames, gravityAlignment, scaled, times } from "./kinematics.js";
+import { add, armPaths, frames, gravityAlignment, scaled, times } from "./kinematics.js";
 
 const AZIMUTH = -0.9, ELEVATION = 0.3; // of the eye, rad
 const AXIS = 0.075, PLATE = 0.16, BALL = 0.085; // half-length of an axis, radius of the plate, largest ball: relative to the size of the arm
@@ -14,14 +14,14 @@ const REDUCED_MOTION = matchMedia("(prefers-reduced-motion: reduce)");
 export function Sketch({ arm, q, label }) {
   const shape = useMemo(() => shapeOf(arm), []);
   const { size, most } = shape;
-  const { chain, centres, axes } = pose(shape, useGliding(q));
+  const { links, centres, axes } = pose(shape, useGliding(q));
   const plate = circle(PLATE * size).map(project);
-  const view = useView(size, [...chain, ...centres, ...plate]);
+  const view = useView(size, [...links.flat(), ...centres, ...plate]);
   const ball = ({ mass }) => BALL * size * Math.cbrt(Math.max(mass, 0) / most);
   return html`<svg class="arm-sketch" role="img" aria-label=${label} viewBox=${view}>
     <path class="plate" d=${`${path(plate)}Z`} />
-    <path class="links-edge" stroke-width=${0.075 * size} d=${path(chain)} />
-    <path class="links" stroke-width=${0.055 * size} d=${path(chain)} />
+    <path class="links-edge" stroke-width=${0.075 * size} d=${links.map(path).join("")} />
+    <path class="links" stroke-width=${0.055 * size} d=${links.map(path).join("")} />
     ${shape.joints.map((each, place) => html`<circle class="mass" r=${ball(each)} cx=${centres[place][0]} cy=${centres[place][1]} />`)}
     ${shape.joints.map((each, place) => html`<path class="axis" stroke=${jointVar(each.joint)} stroke-width=${0.036 * size} d=${path(axes[place])} />`)}
   </svg>`;
@@ -81,7 +81,7 @@ function pose({ joints, size, up }, q) {
   const centres = turned.map(({ origin, out }, place) => add(origin, out(joints[place].centre)));
   const ends = ({ origin, axis }) => [-AXIS * size, AXIS * size].map((length) => project(add(origin, scaled(axis, length))));
   return {
-    chain: [[0, 0, 0], ...turned.map((each) => each.origin), centres.at(-1)].map(project),
+    links: armPaths(joints, turned.map((each) => each.origin), centres).map((each) => each.map(project)),
     centres: centres.map(project),
     axes: turned.map(ends),
   };

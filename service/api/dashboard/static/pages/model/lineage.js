@@ -98,6 +98,7 @@ function fitFacts({ fit: report, compact, calibration, conformal, lineage: from 
     [html`<${Term} of="effective-samples">Effective samples<//>`, count(report.independent_samples)],
     ["Calibration factor of the model’s std", number(calibration.function_std_factor)],
   ];
+  if (report.arms) found.push(["Arms on one base", count(report.arms)]);
   if (report.fixed_joints) found.push(["Fixed at zero, not in the data", report.fixed_joints]);
   if (conformal) {
     found.push(

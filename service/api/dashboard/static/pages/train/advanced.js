@@ -20,7 +20,7 @@ export function Advanced({ values, onchange }) {
 }
 
 function Option({ name, schema, value, onchange }) {
-  const hint = [schema.description, `Default: ${schema.default}.`].filter(Boolean).join(". ").replaceAll("`", "");
+  const hint = [schema.description, schema.default !== "" && `Default: ${schema.default}.`].filter(Boolean).join(". ").replaceAll("`", "");
   const called = `options.${name}`;
   const known = schema.enum ?? (schema.type === "boolean" ? [true, false] : null);
   const chosen = (event) => known[event.target.selectedIndex];
@@ -29,5 +29,6 @@ function Option({ name, schema, value, onchange }) {
   </select>`;
   const number = (attributes) => html`<input ...${attributes} type="number" name=${called} min=${schema.minimum} max=${schema.maximum} step=${schema.type === "integer" ? "1" : "any"}
     placeholder=${schema.default} value=${value ?? ""} onInput=${(event) => onchange(event.target.value === "" ? undefined : event.target.valueAsNumber)} />`;
-  return html`<${Field} label=${name.replaceAll("_", " ")} hint=${hint} input=${known ? select : number} />`;
+  const text = (attributes) => html`<input ...${attributes} name=${called} value=${value ?? ""} onInput=${(event) => onchange(event.target.value.trim() || undefined)} />`;
+  return html`<${Field} label=${name.replaceAll("_", " ")} hint=${hint} input=${known ? select : schema.type === "string" ? text : number} />`;
 }
