@@ -362,9 +362,13 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
 
 def _joints_report(task: Task) -> dict[str, str | int]:
     """Return the number of several arms, and the joints of the URDF that the data lack, such as those of a gripper."""
-    fixed = () if task.robot is None else task.robot.fixed_joints
-    report: dict[str, str | int] = {"fixed_joints": list_joints(fixed)[:MAX_TEXT_LENGTH]} if fixed else {}
-    return {**report, "arms": len(task.roots)} if len(task.roots) > 1 else report
+    report: dict[str, str | int] = {"arms": len(task.roots)} if len(task.roots) > 1 else {}
+    if task.robot is not None and task.robot.fixed_joints:
+        report["fixed_joints"] = list_joints(task.robot.fixed_joints)[:MAX_TEXT_LENGTH]
+    if task.robot is not None and task.robot.followers:
+        pairs = (f"{each.joint} follows {each.leader}" for each in task.robot.followers)
+        report["followed_joints"] = ", ".join(pairs)[:MAX_TEXT_LENGTH]
+    return report
 
 
 def _search_report(

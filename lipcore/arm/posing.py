@@ -15,7 +15,7 @@ from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_from_torque
 from lipcore.kernels.drive.kernel import Bodies, Drive, Elements
 from lipcore.kernels.drive.play import element_widths
-from lipcore.kernels.drive.terms import BASE_TERMS, MAX_GAIN_STD, SIGN_WIDTH, check_kinds
+from lipcore.kernels.drive.terms import BASE_TERMS, KIND_TERMS, MAX_GAIN_STD, SIGN_WIDTH, check_kinds
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.vocabulary import DriveKind, GeometryMode, JointType
@@ -131,8 +131,8 @@ def _expected(
 def with_kind(problem: Problem, point: Point, kind: DriveKind, joints: NDArray[np.bool_]) -> Problem:
     """Return the same problem with another kind of friction. The load is that of a point's bodies.
 
-    joints: (n,), those that have the kind. The prior std of a new term is that of the Coulomb term, for the term's
-    largest size in the samples; that of a gain is MAX_GAIN_STD.
+    joints: (n,), those that have the kind, beside those that have it already. The prior std of a new term is that of
+    the Coulomb term, for the term's largest size in the samples; that of a gain is MAX_GAIN_STD.
     """
     n, first, before = problem.n_joints, problem.bodies, problem.drive
     kinds, elements = check_kinds((*before.kinds, kind)), before.elements
@@ -145,16 +145,14 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind, joints: NDArray[n
     unit, scale = np.empty((2, n, len(terms)))
     used = np.empty(unit.shape, np.bool_)
     for place, term in enumerate(terms):
-        used[:, place] = problem.used[:, known.index(term)] if term in known else joints
-    for values, old in ((unit, problem.unit), (scale, problem.scale)):
-        of_joint = old[first:].reshape(n, -1)
-        for place, term in enumerate(terms):
-            if term in known:
-                values[:, place] = of_joint[:, known.index(term)]
-            elif term == "gain":
-                values[:, place] = MAX_GAIN_STD
-            else:
-                values[:, place] = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[:, place], 1e-3)
+        had = problem.used[:, known.index(term)] if term in known else np.zeros(n, np.bool_)
+        new = joints & ~had if term in KIND_TERMS[kind] else np.zeros(n, np.bool_)
+        used[:, place] = had | new
+        for values, old in ((unit, problem.unit), (scale, problem.scale)):
+            of_joint = old[first:].reshape(n, -1)
+            usual = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[:, place], 1e-3)
+            added = np.full(n, MAX_GAIN_STD) if term == "gain" else usual
+            values[:, place] = np.where(new, added, of_joint[:, known.index(term)]) if term in known else added
     return replace(
         problem,
         friction=drive.features(problem.motions),

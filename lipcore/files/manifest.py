@@ -91,6 +91,7 @@ class Fit(TypedDict, total=False):
     seconds: NonNegative
     device: Annotated[str, Meta(pattern=r"^[a-z]{1,10}(:\d{1,3})?$")]
     fixed_joints: Sentence
+    followed_joints: Sentence
     arms: Count
     geometry: Annotated[str, one_of(GEOMETRY_MODES)]
     friction_terms: Count

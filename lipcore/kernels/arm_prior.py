@@ -144,7 +144,7 @@ def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", 
         bodies,
         bodies if prior == "urdf" else np.zeros_like(bodies),
         unit,
-        np.zeros(robot.n_joints),
+        robot.rotors() if prior == "urdf" else np.zeros(robot.n_joints),
         np.zeros(steps),
         widths_of(geometry)[:steps],
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -41,6 +41,20 @@ class Description:
 
 
 @dataclass(frozen=True)
+class Follower:
+    """A slider that follows another one on the same link, such as the second finger of a gripper.
+
+    With the leader's position q, it is displaced by `rate` · q along the leader's axis.
+    """
+
+    joint: str
+    leader: str
+    rate: float
+    body: Array = field(repr=False, compare=False)
+    """Inertial parameters of what it moves, in the frame of the leader at q = 0, (10,)."""
+
+
+@dataclass(frozen=True)
 class RigidBody:
     """Serial arms on one fixed base, with n moving bodies, in the order of the data's joints."""
 
@@ -57,6 +71,8 @@ class RigidBody:
     """Pinocchio's model, with every other joint locked at neutral: its arms one after another."""
     fixed_joints: tuple[str, ...] = ()
     """The URDF's joints that move, but are locked because the data lack them."""
+    followers: tuple[Follower, ...] = ()
+    """Joints that follow one of the data."""
 
     @classmethod
     def from_urdf(
@@ -118,10 +134,14 @@ class RigidBody:
                 raise JointMismatchError(
                     f"joint {data_name!r} is {kind} in the data, but {joint.name!r} of robot {robot!r} is {joint.kind}"
                 )
-        _check_mimicry(everything, urdf_joints)
-        model = _reduce(_parse(text.plain), urdf_joints)
-        fixed = tuple(joint for joint in movable if joint not in chosen)
-        return cls(robot, urdf, names, types, urdf_joints, matched, model, fixed)
+        following = _find_followers(everything, urdf_joints)
+        full = _reduce(_parse(text.plain), (*urdf_joints, *(joint.name for joint in following)))
+        followers = tuple(_follower(full, joint) for joint in following)
+        model = _reduce(full, urdf_joints, {joint.name: joint.offset for joint in following}) if following else full
+        _check_chain(tuple(model.names)[1:], [int(parent) - 1 for parent in tuple(model.parents)[1:]])
+        moved = chosen | {joint.name for joint in following}
+        fixed = tuple(joint for joint in movable if joint not in moved)
+        return cls(robot, urdf, names, types, urdf_joints, matched, model, fixed, followers)
 
     @property
     def n_joints(self) -> int:
@@ -145,9 +165,28 @@ class RigidBody:
         return tuple(index for index, parent in enumerate(tuple(self.model.parents)[1:]) if parent == 0)
 
     def parameters(self) -> Array:
-        """Return the inertial parameters of the body that each joint moves, locked links included: (n, 10)."""
-        chain = [inertia.toDynamicParameters() for inertia in tuple(self.model.inertias)[1:]]
+        """Return the inertial parameters of the body that each joint moves, locked links included: (n, 10).
+
+        A follower's body is locked to the link before at first. Then `rate` times this body moves from there to the
+        leader, so that both have the centre of mass of leader and follower at every position.
+        """
+        pin, model = pinocchio(), self.model
+        chain = [inertia.toDynamicParameters() for inertia in tuple(model.inertias)[1:]]
+        for each in self.followers:
+            leader = model.getJointId(each.leader)
+            chain[leader - 1] = chain[leader - 1] + each.rate * each.body
+            if (before := model.parents[leader]) > 0:
+                # parameters are linear in the mass, so those of a body of any sign are those of the body times the sign
+                placed = model.jointPlacements[leader].act(pin.Inertia.FromDynamicParameters(each.body))
+                chain[before - 1] = chain[before - 1] - each.rate * placed.toDynamicParameters()
         return np.array(chain)[list(self.order)]
+
+    def rotors(self) -> Array:
+        """Return the inertia of each joint beyond that of `parameters`, (n,) kg: the rest of its followers'."""
+        out = np.zeros(self.n_joints)
+        for each in self.followers:
+            out[self.urdf_joints.index(each.leader)] += (each.rate**2 - each.rate) * each.body[0]
+        return out
 
     def length(self) -> float:
         """Return the characteristic length, m: the mean distance from one joint of an arm to the next."""
@@ -172,18 +211,47 @@ def _mismatch(robot: str, movable: Sequence[str], data: Sequence[str], listed: s
     return JointMismatchError(f"robot {robot!r} has the movable joints {listed_joints}; the data have {given}{listed}")
 
 
-def _check_mimicry(joints: Sequence[UrdfJoint], free: Sequence[str]) -> None:
+def _find_followers(joints: Sequence[UrdfJoint], free: Sequence[str]) -> list[UrdfJoint]:
+    """Return the sliders that follow a slider of the data on the same link; raise UrdfError for other followers."""
+    by_name, found = {joint.name: joint for joint in joints}, list[UrdfJoint]()
     for joint in joints:
         if joint.mimics is not None and joint.name in free:
             raise UrdfError(
                 f"joint {joint.name!r} mimics {joint.mimics!r}: it does not move on its own. Leave it out of the data "
                 "(`drop_joints` of an upload)"
             )
-        if joint.mimics is not None and joint.mimics in free:
-            raise UrdfError(
-                f"joint {joint.name!r} mimics {joint.mimics!r} of the data: a coupled joint cannot be locked. Without "
-                f"{joint.mimics!r} in the data (`drop_joints` of an upload), both are fixed at zero"
-            )
+        if joint.mimics is None or joint.mimics not in free:
+            continue
+        leader = by_name[joint.mimics]
+        if (joint.kind, leader.kind, joint.parent) != ("prismatic", "prismatic", leader.parent):
+            raise _cannot_follow(joint)
+        found.append(joint)
+    return found
+
+
+def _cannot_follow(joint: UrdfJoint) -> UrdfError:
+    return UrdfError(
+        f"joint {joint.name!r} mimics {joint.mimics!r} of the data: only a slider parallel to another one on the same "
+        f"link can follow it. Without {joint.mimics!r} in the data (`drop_joints` of an upload), both are fixed at zero"
+    )
+
+
+def _follower(model: Any, joint: UrdfJoint) -> Follower:
+    """Return a follower of a model in which it moves by itself; raise UrdfError if its axis is not parallel."""
+    pin, (own, leader) = pinocchio(), (model.getJointId(name) for name in (joint.name, joint.mimics))
+    places, axes = [], []
+    for index in (own, leader):
+        data = model.joints[index].createData()
+        model.joints[index].calc(data, np.zeros(1))
+        place = model.jointPlacements[index]
+        places.append(place)
+        axes.append(place.rotation @ np.asarray(data.S).reshape(6)[:3])
+    along = float(axes[0] @ axes[1])
+    if abs(along) < 1 - 1e-6:
+        raise _cannot_follow(joint)
+    slid = pin.SE3(places[0].rotation, places[0].translation + joint.offset * axes[0])
+    body = (places[1].inverse() * slid).act(model.inertias[own]).toDynamicParameters()
+    return Follower(joint.name, str(joint.mimics), joint.multiplier * along, np.asarray(body))
 
 
 def _parse(plain: str) -> Any:
@@ -202,12 +270,14 @@ def _parse(plain: str) -> Any:
     return model
 
 
-def _reduce(full: Any, free: Sequence[str]) -> Any:
-    """Return the model with every joint locked but `free`, which have to form chains from the base to their tips."""
+def _reduce(full: Any, free: Sequence[str], places: Mapping[str, float] | None = None) -> Any:
+    """Return the model with every joint locked but `free`, at neutral or at one of `places`."""
     pin = pinocchio()
-    locked = [full.getJointId(name) for name in tuple(full.names)[1:] if name not in free]
+    locked, at = [full.getJointId(name) for name in tuple(full.names)[1:] if name not in free], pin.neutral(full)
+    for name, place in (places or {}).items():
+        at[full.joints[full.getJointId(name)].idx_q] = place
     try:
-        model = pin.buildReducedModel(full, locked, pin.neutral(full)) if locked else full
+        model = pin.buildReducedModel(full, locked, at) if locked else full
     except (ValueError, RuntimeError) as error:
         raise UrdfError(f"Pinocchio cannot lock the other joints of the URDF: {str(error).strip()[:300]}") from None
     names = tuple(model.names)
@@ -215,7 +285,6 @@ def _reduce(full: Any, free: Sequence[str]) -> Any:
         raise UrdfError(
             f"locking left the joints {', '.join(names[1:])}, expected {', '.join(free)}. A name may be used twice"
         )
-    _check_chain(names[1:], [int(parent) - 1 for parent in tuple(model.parents)[1:]])
     return model
 
 

@@ -53,13 +53,15 @@ class UrdfError(ValueError):
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint of the URDF. kind: its `type` there; mimics: the joint that it follows."""
+    """A joint of the URDF. kind: its `type` there; mimics: the joint that it follows, at multiplier · q + offset."""
 
     name: str
     kind: str
     parent: str
     child: str
     mimics: str | None = None
+    multiplier: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -124,8 +126,11 @@ def scan(text: str, form: str, scanner: Scanner) -> None:
 def _joint(entry: ElementTree.Element) -> UrdfJoint:
     ends = {tag: entry.find(tag) for tag in ("parent", "child", "mimic")}
     parent, child = ("" if (end := ends[tag]) is None else end.get("link", "") for tag in ("parent", "child"))
-    mimics = None if ends["mimic"] is None else ends["mimic"].get("joint", "")
-    return UrdfJoint(entry.get("name", ""), entry.get("type", ""), parent, child, mimics)
+    mimic, own = ends["mimic"], (entry.get("name", ""), entry.get("type", ""), parent, child)
+    if mimic is None:
+        return UrdfJoint(*own)
+    rates = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+    return UrdfJoint(*own, mimic.get("joint", ""), *rates)
 
 
 def _check_tree(links: Sequence[str], joints: Sequence[UrdfJoint]) -> None:

@@ -93,6 +93,8 @@ def print_version(version: Version) -> None:
         echo(f"  {arms} arms on one base, independent of each other")
     if (fixed := version.fit.get("fixed_joints")) is not None:
         echo(f"  fixed at zero, as the data lack them: {fixed}")
+    if (followed := version.fit.get("followed_joints")) is not None:
+        echo(f"  by the URDF, {followed}")
     print_of_joints(version)
     print_judged(version)
     print_warnings(version.warnings)

@@ -100,6 +100,7 @@ function fitFacts({ fit: report, compact, calibration, conformal, lineage: from 
   ];
   if (report.arms) found.push(["Arms on one base", count(report.arms)]);
   if (report.fixed_joints) found.push(["Fixed at zero, not in the data", report.fixed_joints]);
+  if (report.followed_joints) found.push(["Coupled by the URDF", report.followed_joints]);
   if (conformal) {
     found.push(
       ["Blocks for conformal prediction", count(conformal.blocks)],
