@@ -8,8 +8,6 @@ the largest gain in evidence is added, if
 - blocks of the recording are predicted better from the other blocks, beyond their scatter, and
 - friction does not fall with the load, nor play elements push a joint, beyond doubt.
 
-Kinds of several arms on one base are chosen for each arm.
-
 The evidence alone trusts a recording in which joints move together too much; held-out blocks do not.
 """
 
@@ -88,20 +86,18 @@ def choose_drive(problem: Problem, point: Point, rows: NDArray[np.int64], stop: 
     blocks[np.argsort(rows, kind="stable")] = np.arange(len(rows)) * OPTIONS.blocks // len(rows)
     best, gain = rescale(problem, point), 0.0
     errors = held_out_errors(best.problem, best.point, blocks)
-    arms = [point.geometry.arm_of == arm for arm in range(len(point.geometry.roots))]
-    samples = [float(problem.counts[:, own].mean(axis=1).sum()) for own in arms]
+    samples = float(problem.counts.mean(axis=1).sum())
     remembers = problem.motions.shape[1] > POSITIONS
-    kinds = [kind for kind in OPTIONS.kinds if remembers or kind != "play"]
-    open_kinds = [(kind, arm) for kind in kinds for arm in range(len(arms)) if samples[arm] >= _min_samples(kind)]
+    open_kinds = [kind for kind in OPTIONS.kinds if samples >= _min_samples(kind) and (remembers or kind != "play")]
     while open_kinds and not stop():
-        trials = [(_fit_kind(best, point, kind, arms[arm]), kind, arm) for kind, arm in open_kinds]
+        trials = [(_fit_kind(best, point, kind), kind) for kind in open_kinds]
         likely = [each for each in trials if each[0].value < best.value]
-        for trial, kind, arm in sorted(likely, key=lambda each: each[0].value):
-            chosen = _choose_joints(best, trial, point, kind, arms[arm], errors, blocks)
+        for trial, kind in sorted(likely, key=lambda each: each[0].value):
+            chosen = _choose_joints(best, trial, point, kind, errors, blocks)
             if chosen is not None:
                 gain += best.value - chosen.fit.value
                 best, errors = chosen.fit, chosen.errors
-                open_kinds.remove((kind, arm))
+                open_kinds.remove(kind)
                 break
         else:
             break
@@ -117,41 +113,35 @@ class _Chosen:
     """Held-out errors, (B, n) (N·m)²."""
 
 
-def _fit_kind(best: ScaleFit, point: Point, kind: DriveKind, joints: NDArray[np.bool_]) -> ScaleFit:
-    """Return the fit with another kind. joints: (n,), those that have it."""
+def _fit_kind(best: ScaleFit, point: Point, kind: DriveKind, joints: NDArray[np.bool_] | None = None) -> ScaleFit:
+    """Return the fit with another kind. joints: (n,), those that have it; None for all."""
+    joints = np.ones(best.problem.n_joints, np.bool_) if joints is None else joints
     wider = with_kind(best.problem, best.point, kind, joints)
     return rescale(wider, wider.at(point.geometry, point.sigma))
 
 
 def _choose_joints(
-    best: ScaleFit,
-    trial: ScaleFit,
-    point: Point,
-    kind: DriveKind,
-    own: NDArray[np.bool_],
-    errors: Array,
-    blocks: NDArray[np.int64],
+    best: ScaleFit, trial: ScaleFit, point: Point, kind: DriveKind, errors: Array, blocks: NDArray[np.int64]
 ) -> _Chosen | None:
     """Return the fit with a kind; None if it is to be left out.
 
     The joints have it that are predicted better with it, or all if that has the higher evidence. Torque that repeats
-    over a turn is only for joints that turn far enough to show it. trial: with the kind for all joints of an arm; own:
-    mask of these joints, (n,); errors: held-out errors without it.
+    over a turn is only for joints that turn far enough to show it. trial: with the kind for all joints; errors:
+    held-out errors without it.
     """
     wider = held_out_errors(trial.problem, trial.point, blocks)
-    joints, repeats = own & _is_better(errors, wider), kind == "position"
+    joints, repeats = _is_better(errors, wider), kind == "position"
     if repeats:
         turned = np.ptp(best.problem.motions[:, 0], axis=0) > OPTIONS.min_turn_rad
-        joints = own & turned & _is_better(errors, wider, deviations=OPTIONS.min_deviations_of_position)
+        joints = turned & _is_better(errors, wider, deviations=OPTIONS.min_deviations_of_position)
         if not joints.any():
             return None
-    if joints.any() and (joints != own).any():
+    if joints.any() and not joints.all():
         fewer = _fit_kind(best, point, kind, joints)
         if fewer.value < trial.value or repeats:
             trial, wider = fewer, held_out_errors(fewer.problem, fewer.point, blocks)
     supported = best.value - trial.value >= _min_nats(kind) and not _is_implausible(trial.problem, trial.point)
-    better = _is_better(errors[:, own], wider[:, own], together=True)
-    return _Chosen(trial, wider) if supported and better else None
+    return _Chosen(trial, wider) if supported and _is_better(errors, wider, together=True) else None
 
 
 def _min_samples(kind: DriveKind) -> float:

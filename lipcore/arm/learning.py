@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from lipcore.arm import right_angles
+from lipcore.arm import joining, right_angles
 from lipcore.arm.drive import choose_drive
 from lipcore.arm.mounting import Mounting, find_mounting
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_load, with_samples
@@ -79,6 +78,8 @@ class ArmFit:
     """Variance that the arm does not model."""
     report: dict[str, float | int | bool | str]
     """Report for the manifest."""
+    likely: Alternative | None = None
+    """The arm at its most likely parameters, of one arm."""
 
 
 def learn(
@@ -87,7 +88,7 @@ def learn(
     begin: Sequence[Geometry] = (),
     seed: int = 0,
 ) -> ArmFit:
-    """Learn the arm from the samples of a task.
+    """Learn the arm from the samples of a task, or several arms on one base.
 
     task.robot, task.sibling: bodies of a URDF, or the arm of another unit, as the prior of geometry and masses
     according to `options.geometry` and `options.prior`; known: additional start geometries of a search, without robot
@@ -96,71 +97,88 @@ def learn(
 
     Raise FitCancelledError when `task.cancelled` returns true, ValueError for samples that no arm can be learnt from.
     """
+    rows = spread_out(task.samples.motion(), task.options.posterior_samples)
+    known, begin = ([each for each in shapes if each.roots == task.roots] for shapes in (known, begin))
     with threadpool_limits(1):  # matrices are small: more threads would be slower
-        samples, options = task.samples, task.options
-        watch = _Watch(task, time.monotonic())
-        mode, around = mode_of(task), surroundings(task)
-        order = chain(task.robot, samples.n_joints) if around is None else around.order
-        rows = spread_out(samples.motion(), options.posterior_samples)
-        chosen, known = samples.rows(rows), [each for each in known if each.roots == task.roots]
-        problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples, task.roots)
-        if task.sibling is not None:
-            problem = replace(problem, scale_width=WIDTHS.unit)
-        urdf = mode == "calibrate" and task.sibling is None
-        result: SearchResult | None = None
-        if mode == "learn" and not begin:
-            result = _search(task, problem, order, chosen, known, seed, watch)
-            starts = [(each.geometry, each.sigma) for each in result.points[: OPTIONS.polished]]
+        if len(task.roots) == 1:
+            fit = _learn_arm(task, rows, known, begin, seed)
         else:
-            if around is not None and (mode == "fixed" or not begin or urdf):
-                begin = [around.geometry]
-            level = noise.start(samples)[order]
-            starts = [(each, level) for each in begin]
-        polished = Pool(problem.recombined(OPTIONS.check_motions))
-        for geometry, sigma in starts:
-            polished.add(problem.descend(geometry, sigma, OPTIONS.polish_steps, watch.stop))
-        ends = polished.points
-        watch.step("hyperparameters", ends[0].value, 0.85)
-        counting = _Counting(
-            task.contiguous(OPTIONS.max_contiguous_rows), order, shared_rows(samples, task.joint_types, len(rows))
-        )
-        problem = counting.applied(problem, ends[0], at_rest=False)
-        ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        mounting: Mounting | None = None
-        if urdf:
-            mounting = find_mounting(problem, ends[0], OPTIONS.polish_steps, watch.stop)
-            problem, ends = mounting.problem, [mounting.point]
-        found, drive_nats = _refine(problem, ends, counting, watch, known if mode == "learn" else None, rows)
-        best, problem = found[0].point, found[0].problem
-        misfit, _ = counting.misfit(problem, best, best.sigma**2)
-        watch.step("posterior", best.value, 0.95)
-        report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
-        report |= _joints_report(task)
-        if result is not None:
-            report |= _search_report(result, ends, found)
-        report |= {
-            "objective": best.value,
-            "drive": ", ".join(problem.drive.kinds),
-            "drive_nats": drive_nats,
-            "iterations": watch.iteration,
-            "converged": result is None or result.ended == "idle",
-            "samples_given": len(samples),
-            "samples_hyperparameters": len(rows),
-            "samples_posterior": len(rows),
-            "independent_samples": float(problem.counts.mean(axis=1).sum()),
-            "seconds": time.monotonic() - watch.began,
-            "device": "cpu",
-        }
-        if mounting is not None:
-            report |= mounting.report(best.geometry, order)
-        if mode == "learn":
-            sure = right_angles.right_angle_probabilities(found)[np.argsort(order)]
-            report |= {f"right_angle_{joint + 1}": round(float(each), 3) for joint, each in enumerate(sure)}
-        arm, params = _arm(found, order, mode)
-        place, n = np.argsort(order), problem.n_joints
-        friction = problem.weights(best)[problem.bodies :].reshape(n, -1)
-        misfit = misfit.with_friction(friction @ passing_row(problem.drive.kinds)).of_joints(place)
-        return ArmFit(arm, params, rows, problem.counts[:, place], misfit, report)
+            fits = []
+            for number, part in enumerate(joining.split(task)):
+                shapes, starts = ([each.arms[number][2] for each in several] for several in (known, begin))
+                if task.robot is None and task.sibling is None:
+                    shapes += known_geometries(part.joint_types, task.gravity)
+                fits.append(_learn_arm(part, rows, shapes, starts, seed))
+            fit = joining.join(task, fits)
+    return replace(fit, report={**fit.report, **_joints_report(task)})
+
+
+def _learn_arm(
+    task: Task, rows: NDArray[np.int64], known: Sequence[Geometry], begin: Sequence[Geometry], seed: int
+) -> ArmFit:
+    """Learn one arm from these rows of a task, see `learn`."""
+    samples, watch = task.samples, _Watch(task, time.monotonic())
+    mode, around = mode_of(task), surroundings(task)
+    order = chain(task.robot, samples.n_joints) if around is None else around.order
+    chosen = samples.rows(rows)
+    problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples)
+    if task.sibling is not None:
+        problem = replace(problem, scale_width=WIDTHS.unit)
+    urdf = mode == "calibrate" and task.sibling is None
+    result: SearchResult | None = None
+    if mode == "learn" and not begin:
+        result = _search(task, problem, order, chosen, known, seed, watch)
+        starts = [(each.geometry, each.sigma) for each in result.points[: OPTIONS.polished]]
+    else:
+        if around is not None and (mode == "fixed" or not begin or urdf):
+            begin = [around.geometry]
+        level = noise.start(samples)[order]
+        starts = [(each, level) for each in begin]
+    polished = Pool(problem.recombined(OPTIONS.check_motions))
+    for geometry, sigma in starts:
+        polished.add(problem.descend(geometry, sigma, OPTIONS.polish_steps, watch.stop))
+    ends = polished.points
+    watch.step("hyperparameters", ends[0].value, 0.85)
+    counting = _Counting(
+        task.contiguous(OPTIONS.max_contiguous_rows), order, shared_rows(samples, task.joint_types, len(rows))
+    )
+    problem = counting.applied(problem, ends[0], at_rest=False)
+    ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
+    mounting: Mounting | None = None
+    if urdf:
+        mounting = find_mounting(problem, ends[0], OPTIONS.polish_steps, watch.stop)
+        problem, ends = mounting.problem, [mounting.point]
+    found, drive_nats = _refine(problem, ends, counting, watch, known if mode == "learn" else None, rows)
+    best, problem = found[0].point, found[0].problem
+    misfit, _ = counting.misfit(problem, best, best.sigma**2)
+    watch.step("posterior", best.value, 0.95)
+    report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
+    if result is not None:
+        report |= _search_report(result, ends, found)
+    report |= {
+        "objective": best.value,
+        "drive": ", ".join(problem.drive.kinds),
+        "drive_nats": drive_nats,
+        "iterations": watch.iteration,
+        "converged": result is None or result.ended == "idle",
+        "samples_given": len(samples),
+        "samples_hyperparameters": len(rows),
+        "samples_posterior": len(rows),
+        "independent_samples": float(problem.counts.mean(axis=1).sum()),
+        "seconds": time.monotonic() - watch.began,
+        "device": "cpu",
+    }
+    if mounting is not None:
+        report |= mounting.report(best.geometry, order)
+    if mode == "learn":
+        sure = right_angles.right_angle_probabilities(found)[np.argsort(order)]
+        report |= {f"right_angle_{joint + 1}": round(float(each), 3) for joint, each in enumerate(sure)}
+    arm, params = _arm(found, order, mode)
+    place, n = np.argsort(order), problem.n_joints
+    friction = problem.weights(best)[problem.bodies :].reshape(n, -1)
+    misfit = misfit.with_friction(friction @ passing_row(problem.drive.kinds)).of_joints(place)
+    likely = _alternative(problem, best, place, 1.0)
+    return ArmFit(arm, params, rows, problem.counts[:, place], misfit, report, likely)
 
 
 @dataclass(frozen=True)
@@ -205,53 +223,12 @@ def _search(
     seed: int,
     watch: _Watch,
 ) -> SearchResult:
-    """Search for the geometry on a few of the rows `samples` of a problem, for each arm by itself."""
-    arms, seconds, results = _split(task, problem, order, samples), task.options.search_seconds, list[SearchResult]()
-    for number, (joints, part, own) in enumerate(arms):
-        types = tuple(task.joint_types[joint] for joint in joints)
-        few = spread_out(own.motion(), max(OPTIONS.min_search_rows, OPTIONS.search_rows_per_joint * len(types)))
-        sensor = noise_level([task.signals.tau[part][:, joints] for part in task.signals.episodes()])
-        step = partial(watch.searching, part=(number, len(arms)))
-        shapes = (
-            known
-            if len(arms) == 1
-            else [*(each.arms[number][2] for each in known), *known_geometries(types, task.gravity)]
-        )
-        results.append(search(part.rows(few), types, task.gravity, sensor, seconds / len(arms), seed, shapes, step))
-    return results[0] if len(results) == 1 else _join(problem, results)
-
-
-def _split(
-    task: Task, problem: Problem, order: NDArray[np.int64], samples: Samples
-) -> list[tuple[NDArray[np.int64], Problem, Samples]]:
-    """Return the data's joints, the problem and the samples of each arm."""
-    if len(task.roots) == 1:
-        return [(order, problem, samples)]
-    out = []
-    for joints in np.split(order, task.roots[1:]):
-        types = tuple(task.joint_types[joint] for joint in joints)
-        own, every = samples.joints(joints), task.samples.joints(joints)
-        out.append((joints, make_problem(own, types, np.arange(len(types)), task.gravity, None, every), own))
-    return out
-
-
-def _join(problem: Problem, results: Sequence[SearchResult]) -> SearchResult:
-    """Return the optima of all arms: the best with the best, then the next ones."""
-    points = []
-    for rank in range(max(len(each.points) for each in results)):
-        parts = [each.points[min(rank, len(each.points) - 1)] for each in results]
-        geometry = Geometry.joined([each.geometry for each in parts])
-        points.append(problem.at(geometry, np.concatenate([each.sigma for each in parts])))
-    return SearchResult(
-        tuple(points),
-        sum(each.starts for each in results),
-        sum(each.hops for each in results),
-        sum(each.distinct for each in results),
-        min(each.times_best for each in results),
-        all(each.explained for each in results),
-        "time" if any(each.ended == "time" for each in results) else "idle",
-        sum(each.seconds for each in results),
-    )
+    """Search for the geometry on a few of the rows `samples` of a problem."""
+    types = tuple(task.joint_types[joint] for joint in order)
+    few = spread_out(samples.motion(), max(OPTIONS.min_search_rows, OPTIONS.search_rows_per_joint * len(types)))
+    sensor = noise_level([task.signals.tau[part][:, order] for part in task.signals.episodes()])
+    seconds = task.options.search_seconds
+    return search(problem.rows(few), types, task.gravity, sensor, seconds, seed, known, watch.searching)
 
 
 def _refine(
@@ -404,10 +381,9 @@ class _Watch:
             most, elapsed = self.task.options.max_iterations, time.monotonic() - self.began
             self.task.on_progress(FitProgress(stage, self.iteration, most, objective, fraction, elapsed))
 
-    def searching(self, objective: float, fraction: float, part: tuple[int, int] = (0, 1)) -> None:
-        """Report a step of the search, the longest part of the work. part: number of an arm, and count of arms."""
-        number, count = part
-        self.step("geometry", objective, 0.8 * (number + min(fraction, 1.0)) / count)
+    def searching(self, objective: float, fraction: float) -> None:
+        """Report a step of the search, the longest part of the work."""
+        self.step("geometry", objective, 0.8 * min(fraction, 1.0))
 
     def stop(self) -> bool:
         """Return whether the caller has cancelled."""

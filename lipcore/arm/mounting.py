@@ -114,8 +114,7 @@ def mount(geometry: Geometry, position: str) -> Geometry:
     """Return the geometry with its base in one of POSITIONS."""
     turn = rotation_of(np.array(POSITIONS[position]))
     rotation, translation = geometry.rotation.copy(), geometry.translation.copy()
-    for root in geometry.roots:
-        rotation[root], translation[root] = turn @ rotation[root], turn @ translation[root]
+    rotation[0], translation[0] = turn @ rotation[0], turn @ translation[0]
     return replace(geometry, rotation=rotation, translation=translation)
 
 
@@ -149,9 +148,9 @@ def find_position(problem: Problem, point: Point, steps: int, stop: Callable[[],
 
 
 def tilt_deg(geometry: Geometry, other: Geometry) -> float:
-    """Return the angle between gravity in the first joint's frame of two geometries, degrees: max of all arms."""
-    one, two = (each.rotation[[*each.roots]].mT @ each.gravity for each in (geometry, other))
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(one, two), axis=1), (one * two).sum(1))).max())
+    """Return the angle between gravity in the first joint's frame of two geometries, degrees."""
+    one, two = (each.rotation[0].T @ each.gravity for each in (geometry, other))
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(one, two)), one @ two)))
 
 
 def around(problem: Problem, geometry: Geometry) -> Problem:

@@ -15,7 +15,7 @@ from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_from_torque
 from lipcore.kernels.drive.kernel import Bodies, Drive, Elements
 from lipcore.kernels.drive.play import element_widths
-from lipcore.kernels.drive.terms import BASE_TERMS, KIND_TERMS, MAX_GAIN_STD, SIGN_WIDTH, check_kinds
+from lipcore.kernels.drive.terms import BASE_TERMS, MAX_GAIN_STD, SIGN_WIDTH, check_kinds
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.vocabulary import DriveKind, GeometryMode, JointType
@@ -58,13 +58,12 @@ def make_problem(
     gravity: bool,
     around: Arm | None = None,
     every: Samples | None = None,
-    roots: tuple[int, ...] = (0,),
 ) -> Problem:
     """Return the problem of learning an arm from N samples, base to tip.
 
     joint_types: (n,), in the order of the data; order: (n,), the data's joint at each place of the chain; gravity:
     whether torques contain it; around: prior arm of geometry and masses; every: all samples, for the size of torques
-    and noise, `samples` if None; roots: first joint of each arm, if there is no prior arm.
+    and noise, `samples` if None.
     """
     n, every = samples.n_joints, samples if every is None else every
     drive = Drive(n)
@@ -93,7 +92,7 @@ def make_problem(
         unit,
         start,
         floor,
-        _expected(types, gravity, around, roots),
+        _expected(types, gravity, around),
         drive,
         np.ones((n, len(BASE_TERMS)), np.bool_),
     )
@@ -111,9 +110,7 @@ def _in_chain(samples: Samples, order: NDArray[np.int64]) -> tuple[Array, Array]
     return np.ascontiguousarray(samples.motion().arrays()[:, :, order]), in_chain(samples.tau, order)
 
 
-def _expected(
-    types: tuple[JointType, ...], gravity: bool, around: Arm | None, roots: tuple[int, ...]
-) -> GeometryPrior | None:
+def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -> GeometryPrior | None:
     if around is not None:
         return GeometryPrior(around.widths, around.geometry.moved(around.expected)) if around.steps else None
     n = len(types)
@@ -123,7 +120,6 @@ def _expected(
         np.zeros((n, 3)),
         np.tile([0.0, 0.0, 1.0], (n, 1)),
         np.array([0.0, 0.0, -1.0 if gravity else 0.0]),
-        roots,
     )
     return GeometryPrior.anything(any_arm)
 
@@ -131,8 +127,8 @@ def _expected(
 def with_kind(problem: Problem, point: Point, kind: DriveKind, joints: NDArray[np.bool_]) -> Problem:
     """Return the same problem with another kind of friction. The load is that of a point's bodies.
 
-    joints: (n,), those that have the kind, beside those that have it already. The prior std of a new term is that of
-    the Coulomb term, for the term's largest size in the samples; that of a gain is MAX_GAIN_STD.
+    joints: (n,), those that have the kind. The prior std of a new term is that of the Coulomb term, for the term's
+    largest size in the samples; that of a gain is MAX_GAIN_STD.
     """
     n, first, before = problem.n_joints, problem.bodies, problem.drive
     kinds, elements = check_kinds((*before.kinds, kind)), before.elements
@@ -145,14 +141,16 @@ def with_kind(problem: Problem, point: Point, kind: DriveKind, joints: NDArray[n
     unit, scale = np.empty((2, n, len(terms)))
     used = np.empty(unit.shape, np.bool_)
     for place, term in enumerate(terms):
-        had = problem.used[:, known.index(term)] if term in known else np.zeros(n, np.bool_)
-        new = joints & ~had if term in KIND_TERMS[kind] else np.zeros(n, np.bool_)
-        used[:, place] = had | new
-        for values, old in ((unit, problem.unit), (scale, problem.scale)):
-            of_joint = old[first:].reshape(n, -1)
-            usual = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[:, place], 1e-3)
-            added = np.full(n, MAX_GAIN_STD) if term == "gain" else usual
-            values[:, place] = np.where(new, added, of_joint[:, known.index(term)]) if term in known else added
+        used[:, place] = problem.used[:, known.index(term)] if term in known else joints
+    for values, old in ((unit, problem.unit), (scale, problem.scale)):
+        of_joint = old[first:].reshape(n, -1)
+        for place, term in enumerate(terms):
+            if term in known:
+                values[:, place] = of_joint[:, known.index(term)]
+            elif term == "gain":
+                values[:, place] = MAX_GAIN_STD
+            else:
+                values[:, place] = of_joint[:, BASE_TERMS.index("coulomb")] / np.maximum(largest[:, place], 1e-3)
     return replace(
         problem,
         friction=drive.features(problem.motions),

@@ -192,10 +192,9 @@ def apply_layout(geometry: Geometry, layout: Layout) -> Geometry:
     for joint, direction in enumerate(layout):
         if direction is not None:
             turns[joint] = rotation_to_axis(DIRECTIONS[direction]) @ rotation_to_axis(geometry.axis[joint]).T
-    before, steps = np.roll(turns, 1, axis=0), places - np.roll(places, 1, axis=0)
-    for root in geometry.roots:
-        before[root], steps[root] = np.eye(3), places[root]
+    before = np.concatenate([np.eye(3)[None], turns[:-1]])
     rotation = before.mT @ turns
+    steps = np.diff(places, axis=0, prepend=np.zeros((1, 3)))
     return replace(geometry, rotation=rotation, translation=(before.mT @ steps[..., None])[..., 0])
 
 
@@ -212,6 +211,5 @@ def _turn_upright(geometry: Geometry) -> tuple[Geometry, Array]:
     angles = [np.arccos(np.clip((axes @ turn.T @ DIRECTIONS.T).max(axis=1), -1, 1)) for turn in turns]
     best = int(np.argmin([np.minimum(each, np.radians(20)).sum() for each in angles]))
     rotation, translation = geometry.rotation.copy(), geometry.translation.copy()
-    for root in geometry.roots:
-        rotation[root], translation[root] = turns[best] @ rotation[root], turns[best] @ translation[root]
+    rotation[0], translation[0] = turns[best] @ rotation[0], turns[best] @ translation[0]
     return replace(geometry, rotation=rotation, translation=translation), angles[best]

@@ -114,6 +114,23 @@ class Arm:
         """Types of the joints, (n,), in the order of the data."""
         return tuple(self.geometry.joint_types[place] for place in self.place)
 
+    def part(self, number: int) -> Arm:
+        """Return one of several arms by itself, for data with its joints from base to tip, without its friction."""
+        joints, numbers, geometry = self.geometry.arms[number]
+        data, bodies = self.order[joints], PARAMETERS * self.n_joints
+        units = self.unit[:bodies].reshape(-1, PARAMETERS)[data], self.unit[bodies:][data]
+        return Arm(
+            geometry,
+            np.arange(len(data)),
+            self.mode,
+            self.parameters[joints],
+            self.centre[joints],
+            np.concatenate([each.reshape(-1) for each in units]),
+            self.rotor[data],
+            self.expected[numbers] if self.steps else self.expected,
+            self.widths[numbers] if self.steps else self.widths,
+        )
+
     @cached_property
     def friction(self) -> Drive:
         """The drive, in the order of the data's joints."""

@@ -143,6 +143,13 @@ class RigidBody:
         fixed = tuple(joint for joint in movable if joint not in moved)
         return cls(robot, urdf, names, types, urdf_joints, matched, model, fixed, followers)
 
+    def part(self, joints: Sequence[int]) -> RigidBody:
+        """Return the bodies for some of the data's joints, in this order; the others are locked."""
+        names, types, urdf_joints = (
+            tuple(each[joint] for joint in joints) for each in (self.joint_names, self.joint_types, self.urdf_joints)
+        )
+        return self._build(self.urdf, names, types, urdf_joints, self.name, self.matched)
+
     @property
     def n_joints(self) -> int:
         """Return the number of joints n."""
