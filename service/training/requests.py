@@ -71,14 +71,15 @@ def check_draft(queue: JobQueue, draft: JobDraft) -> None:
 def with_default_robot(
     database: Database, request: JobRequest, rows: Sequence[DatasetRow], joint_types: Sequence[str]
 ) -> JobRequest:
-    """Return a request with the robot of its data sets, unless it names one or null, or its estimator uses none.
+    """Return a request with the robot of its data sets, unless it names one, null or arms, or its estimator uses none.
 
     A robot without a usable URDF is not used: such data sets only have its limits.
     """
     # of an uploaded URDF, the report has only the name
     known = {(row.report.get("upload_options") or {}).get("robot") or row.report.get("robot") for row in rows}
     uses_robot = request.base is None and request.estimator in (AUTO, *ROBOT_ESTIMATORS)
-    if "robot" in request.model_fields_set or not uses_robot or len(known) != 1 or (robot := known.pop()) is None:
+    told = "robot" in request.model_fields_set or request.options.arms
+    if told or not uses_robot or len(known) != 1 or (robot := known.pop()) is None:
         return request
     try:
         robots.resolve(database, robot, rows[0].joint_names, joint_types)
