@@ -123,7 +123,8 @@ def linearised_torque(geometry: Geometry, bodies: Array, x: State, around: Array
 
 
 def _torque(chain: Chain, bodies: Array) -> Array:
-    return _power(chain.screw, _bodies(chain, bodies).behind().force)
+    moment, force = _bodies(chain, bodies).force
+    return _power(chain.screw, (_behind(moment), _behind(force)))
 
 
 def _chain(geometry: Geometry, x: State) -> Chain:

@@ -15,6 +15,7 @@ from lipcore.export.c_writer import c_files
 from lipcore.model import dynamics
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
+from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compression import build_linear
 from tests.choosing import few, slow
 from tests.lipcore.arm_oracles import (
