@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.online.acceleration import derive, window
+from service.cli.verify import verify_home
 from tests.service.learning.learning_models import RATE
 from tests.service.learning.recordings import (
     assert_learnt,
@@ -100,6 +101,15 @@ def test_edge_rows_are_learnt_with_the_next_batch(learning_model):
     assert (first["accepted"], first["rejected"]) == (30 - 2 * HALF_WINDOW, {"edge": 2 * HALF_WINDOW})
     assert (second["accepted"], second["rejected"]) == (ROWS - 30, {"edge": HALF_WINDOW})
     assert second["derived"]["ddq"]["carried"] == HALF_WINDOW
+
+
+def test_verify_accepts_batches_logged_with_rows_of_their_neighbours(learning_service, learning_model):
+    for number, part in enumerate(cut_batches([20, 34])):
+        send_batch(learning_model, number, part)
+    logged = [len(rows) for rows in read_logged_rows(learning_service, learning_model)]
+    assert logged == [20, 14 + HALF_WINDOW, ROWS - 34 + HALF_WINDOW]
+    found = verify_home(learning_service.client.app.state.storage.settings)
+    assert [each for each in found.damages if repr(learning_model.name) in each.name] == []
 
 
 def test_unlearnt_batches_carry_no_rows(learning_model):
