@@ -13,6 +13,7 @@ from fastapi_offline import FastAPIOffline
 from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
+from lipcore.posterior.threads import limit_threads
 from service import __version__
 from service.api import errors, metrics, openapi, requests
 from service.api.access.keys import REFRESH_S, Keyring
@@ -79,11 +80,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         lock = lock_home(settings.home)
-        storage, jobs, learners = await to_thread.run_sync(_open, settings)
-        threadpool_limits(SERVING_THREADS)  # of BLAS; the models imported its libraries
-        from lipcore.posterior.threads import limit_threads  # noqa: PLC0415 - the numerics, which are loaded by now
-
+        # before a model is loaded: BLAS rounds differently with another number of threads
+        threadpool_limits(SERVING_THREADS)
         limit_threads(SERVING_THREADS)
+        storage, jobs, learners = await to_thread.run_sync(_open, settings)
         webhook = Webhook(storage.database, settings)
         _share(app, storage, jobs, learners, webhook)
         stop_following = storage.database.follow_others(lambda: Replication(learners).close)

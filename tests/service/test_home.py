@@ -5,6 +5,8 @@ import json
 import os
 import shutil
 import stat
+import subprocess
+import sys
 
 import pytest
 from fastapi.testclient import TestClient
@@ -13,6 +15,7 @@ from sqlalchemy import select
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.models import shipped
+from service.runtime.process import THREAD_VARIABLES
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
 from service.storage.storage import HomeInUseError, lock_home
@@ -93,6 +96,39 @@ def test_interrupted_jobs_are_done_again_up_to_three_times_or_cancelled(second_s
     assert (seen["state"], seen["attempts"], seen["error"]["code"]) == ("failed", 3, "interrupted")
     assert seen["finished_at"]
     assert job(api, "job_unwanted")["state"] == "cancelled"
+
+
+THREADS_AT_FIRST_LOAD = """
+import sys
+from fastapi.testclient import TestClient
+from threadpoolctl import threadpool_info
+from service.app import create_app
+from service.foundation.settings import Settings
+from service.storage.files import Files
+
+def blas_threads():
+    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+def load_version(*arguments, load=Files.load_version):
+    print(*blas_threads())
+    return load(*arguments)
+
+Files.load_version = load_version
+print(*blas_threads())
+with TestClient(create_app(Settings(home=sys.argv[1]))):
+    pass
+"""
+"""A service that prints the number of threads of BLAS before its start, and when it loads a model."""
+
+
+@pytest.mark.slow
+def test_blas_threads_are_limited_before_the_first_model_is_loaded(home):
+    """With more threads, the service rounds a learnt state differently from the learner process."""
+    command = [sys.executable, "-c", THREADS_AT_FIRST_LOAD, str(home)]
+    environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, "2")}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    before, *loaded = done.stdout.split()
+    assert (before, set(loaded)) == ("2", {"1"})
 
 
 def make_earlier_home(home, job):
