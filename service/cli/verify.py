@@ -27,6 +27,7 @@ from service.models import registry
 from service.runtime.process import SERVING_THREADS
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.database.engine import FILE
+from service.storage.database.readonly import ReadOnlySqlite, is_read_only
 from service.storage.files import Files, FilesUnreachableError
 from service.storage.storage import WAIT_S, HomeError, explain_home_errors
 
@@ -58,10 +59,11 @@ def verify_home(settings: Settings) -> Verified:
     """Read the database, data sets, robots, versions, snapshots and logged observations of a home.
 
     It may run beside the service: an item that the service deletes meanwhile does not count as damaged. Nothing is
-    changed, except that a database of an earlier release is migrated. If services share a database and files, those are
-    read, not local copies.
+    changed, except that a database of an earlier release is migrated. A home may be read-only. If services share a
+    database and files, those are read, not local copies.
 
     Raises:
+        DatabaseVersionError: The database needs a migration, and the home is read-only.
         FileNotFoundError: The home has no database.
         FilesUnreachableError: The shared files cannot be read now.
     """
@@ -70,9 +72,11 @@ def verify_home(settings: Settings) -> Verified:
             f"home is {str(settings.home)!r}, expected a folder with the database of a service: set LIPSERVE_HOME"
         )
     threadpool_limits(SERVING_THREADS)
-    database = Database.of(settings, WAIT_S)
+    read_only = settings.database_url is None and is_read_only(settings.home)
+    adapter = ReadOnlySqlite(settings.home, WAIT_S) if read_only else None
+    database = Database(settings.home, WAIT_S, settings.database_url, settings.database_connections, adapter)
     try:
-        with Files.fresh(settings) as files:
+        with Files.fresh(settings, read_only) as files:
             return _verify(database, files)
     finally:
         database.close()

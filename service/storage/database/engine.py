@@ -213,13 +213,19 @@ class Database:
     - timeout_s: max wait for another writer, s.
     - url: address of a PostgreSQL server; None: SQLite in the home.
     - connections: max open connections to PostgreSQL.
+    - adapter: of another kind, by default the one that the other arguments name.
     - origin: random id of this object in notices to other services.
     """
 
     def __init__(
-        self, home: Path, timeout_s: float = PATIENCE_S, url: str | None = None, connections: int = CONNECTIONS
+        self,
+        home: Path,
+        timeout_s: float = PATIENCE_S,
+        url: str | None = None,
+        connections: int = CONNECTIONS,
+        adapter: Sqlite | None = None,
     ) -> None:
-        self.adapter = _adapter(home, timeout_s, url, connections)
+        self.adapter = adapter or _adapter(home, timeout_s, url, connections)
         self.engine = self.adapter.engine
         migrate(self.engine, self.adapter.lock)
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)

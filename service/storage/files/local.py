@@ -57,10 +57,10 @@ class LocalFiles:
 
     shared = False
 
-    def __init__(self, home: Path) -> None:
+    def __init__(self, home: Path, read_only: bool = False) -> None:
         self._home = home
         self.datasets, self.versions, self.snapshots = home / "datasets", home / "versions", home / "learning"
-        for folder in (self.datasets, self.versions, self.snapshots):
+        for folder in () if read_only else (self.datasets, self.versions, self.snapshots):
             make_folder(folder)
 
     @property

@@ -60,18 +60,26 @@ class Files:
     - cache_bytes: max size of the cache of shared files.
     - patience_s: max time of retries if the store cannot be reached. Then methods raise FilesUnreachableError, an
       OSError.
+    - read_only: write nothing to the home; for a store below the home only.
     - datasets, versions: folders below the home, of the files themselves or of copies, for tests and tools.
 
     Files that cannot be deleted in the store now are deleted at a start of a service, a day later or more.
     """
 
-    def __init__(self, home: Path, url: str | None = None, cache_bytes: int = 4 << 30, patience_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        home: Path,
+        url: str | None = None,
+        cache_bytes: int = 4 << 30,
+        patience_s: float = 0.0,
+        read_only: bool = False,
+    ) -> None:
         self.uploads, self.learning = home / "uploads", home / "learning"
-        for folder in (self.uploads, self.learning):
+        for folder in () if read_only else (self.uploads, self.learning):
             make_folder(folder)
         self._place: LocalFiles | SharedFiles
         if url is None:
-            self._place = LocalFiles(home)
+            self._place = LocalFiles(home, read_only)
         else:
             objects = make_store(url)
             self._place = SharedFiles(home, RetryingStore(objects, patience_s) if patience_s else objects, cache_bytes)
@@ -84,9 +92,9 @@ class Files:
 
     @classmethod
     @contextmanager
-    def fresh(cls, settings: Settings) -> Iterator[Files]:
+    def fresh(cls, settings: Settings, read_only: bool = False) -> Iterator[Files]:
         """Yield a store for verification: it reads no cached copy, and at most one file at a time needs space here."""
-        files = cls.of(settings)
+        files = cls(settings.home, settings.files_url, settings.files_cache_bytes, read_only=read_only)
         with files._place.fresh() as place:
             files._place = place
             yield files
