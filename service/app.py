@@ -21,6 +21,7 @@ from service.api.access.middleware import KeyAccess, LocalAccess
 from service.api.access.scopes import Rules
 from service.api.dashboard import routes as dashboard
 from service.api.guide import routes as guide
+from service.api.head import HeadAsGet
 from service.api.limits.requests import MAX_REQUESTS, PATIENCE, BodyLimit, Gate, RateLimit, Turns, body_limits
 from service.api.metrics import System, Traffic
 from service.api.oip import extension_routes, rpc
@@ -164,6 +165,7 @@ def _add_middleware(
     app: FastAPI, settings: Settings, keyring: Keyring | None, meters: Meters, hot: list[BaseRoute]
 ) -> None:
     """Add the middleware of all requests, from the inside out."""
+    app.add_middleware(HeadAsGet)
     app.add_middleware(
         BodyLimit,
         limits=body_limits(settings),

@@ -146,7 +146,7 @@ def _methods(request: Request) -> list[str]:
         pattern, methods = getattr(route, "path_regex", None), getattr(route, "methods", None)
         if pattern is not None and methods and pattern.match(request.scope["path"]):
             allowed.update(methods)
-    return sorted(allowed)
+    return sorted(allowed | {"HEAD"} if "GET" in allowed else allowed)
 
 
 async def _storage_error(request: Request, error: Exception) -> JSONResponse:
