@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import typer
@@ -22,10 +23,13 @@ from service.cli.options import Json, alone, settings_of
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.foundation.text import counted
+from service.journal.floor import error_floor_of
 from service.journal.log import decode
+from service.journal.recompute import check_same, find_gap, recompute, state_as_trained
+from service.journal.restore import RestoredState, restore
 from service.models import registry
 from service.runtime.process import SERVING_THREADS
-from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
+from service.storage.database import Database, DatasetRow, EventRow, RobotRow, ServingRow, SnapshotRow, VersionRow
 from service.storage.database.engine import FILE
 from service.storage.database.readonly import ReadOnlySqlite, is_read_only
 from service.storage.files import Files, FilesUnreachableError
@@ -56,7 +60,7 @@ class Verified:
 
 
 def verify_home(settings: Settings) -> Verified:
-    """Read the database, data sets, robots, versions, snapshots and logged observations of a home.
+    """Read all that a home stores, and recompute from the logs what its models have learnt.
 
     It may run beside the service: an item that the service deletes meanwhile does not count as damaged. Nothing is
     changed, except that a database of an earlier release is migrated. A home may be read-only. If services share a
@@ -140,15 +144,22 @@ def _read_version(files: Files, row: VersionRow) -> None:
 
 def _snapshots(database: Database, files: Files) -> Iterator[_Finding]:
     with database.session() as session:
-        rows = list(session.scalars(select(SnapshotRow).order_by(SnapshotRow.model, SnapshotRow.version)))
+        rows = list(
+            session.scalars(select(SnapshotRow).order_by(SnapshotRow.model, SnapshotRow.version, SnapshotRow.number))
+        )
         versions = {(row.model, row.version): row for row in session.scalars(select(VersionRow))}
-    base: tuple[tuple[str, int], lipcore.TorqueModel | None] | None = None
-    for row in rows:
-        key = (row.model, row.version)
-        if base is None or base[0] != key:  # one model in memory at a time
-            base = key, _base(files, versions.get(key))
-        reason = _reason(_read_snapshot, files, row, base[1])
-        yield f"{row.id} of version {row.version} of model {row.model!r}", _deletion_check(SnapshotRow, row.seq), reason
+    for key, of_version in groupby(rows, lambda row: (row.model, row.version)):
+        base = _base(files, versions.get(key))  # one model in memory at a time
+        known = None if base is None else state_as_trained(database, *key, base)
+        for row in of_version:
+            reason = _reason(_read_snapshot, files, row)
+            if reason is None and known is not None:
+                try:
+                    known = _compared(database, files, row, known)
+                except (ValueError, OSError) as error:
+                    reason = str(error)
+            name = f"{row.id} of version {row.version} of model {row.model!r}"
+            yield name, _deletion_check(SnapshotRow, row.seq), reason
 
 
 def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
@@ -159,10 +170,38 @@ def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
         return None
 
 
-def _read_snapshot(files: Files, row: SnapshotRow, base: lipcore.TorqueModel | None) -> None:
-    payload = files.read_snapshot(row.id, row.sha256)
-    if base is not None:
-        state.load(base, payload)
+def _read_snapshot(files: Files, row: SnapshotRow) -> None:
+    files.read_snapshot(row.id, row.sha256)
+
+
+def _compared(database: Database, files: Files, row: SnapshotRow, known: RestoredState) -> RestoredState:
+    """Return the state of a snapshot; raise ValueError if it differs from the fold of the log since `known`."""
+    online = state.load(known.online.base, files.read_snapshot(row.id, row.sha256))
+    expected = recompute(database, known, row.number)
+    if expected is not None:
+        check_same(online, expected.online)
+    return replace(known, online=online, number=row.number)
+
+
+def _models(database: Database, files: Files) -> Iterator[_Finding]:
+    """Recompute the state of each serving version from its newest snapshot and the log, and test its predictions."""
+    with database.session() as session:
+        serving = {row.model: row.version for row in session.scalars(select(ServingRow))}
+        versions = {(row.model, row.version): row for row in session.scalars(select(VersionRow))}
+    for model, version in serving.items():
+        gone = _deletion_check(VersionRow, (model, version))
+        base = _base(files, versions.get((model, version)))
+        yield repr(model), gone, None if base is None else _reason(_read_model, database, files, model, version, base)
+
+
+def _read_model(database: Database, files: Files, model: str, version: int, base: lipcore.TorqueModel) -> None:
+    with database.moment() as session:
+        gap = find_gap(session, model)
+    if gap is not None:
+        raise ValueError(f"its log lacks events between {gap[0]} and {gap[1]}")
+    known = restore(database, files, model, version, base)
+    floor = error_floor_of(database, model, version, known.number, base.n_joints)
+    probe(known.online.model(floor))
 
 
 def _observations(database: Database, files: Files) -> Iterator[_Finding]:
@@ -208,6 +247,7 @@ _CHECKS: dict[str, Callable[[Database, Files], Iterator[_Finding]]] = {
     "versions": _versions,
     "snapshots": _snapshots,
     "observations": _observations,
+    "models": _models,
 }
 
 

@@ -138,8 +138,21 @@ def _load_base(
             except (ValueError, OSError) as error:
                 logger.error("snapshot %s of version %d of model %r cannot be used: %s", row.id, version, model, error)
                 limit, torn = row.number - 1, True
-        online = _with_memory(OnlineModel.start(base), log.memory(session, model, start))
-    return RestoredState(model, version, start, online, start, seen, torn)
+        return replace(start_state(session, model, version, base), seen=seen, torn=torn)
+
+
+def start_state(session: Session, model: str, version: int, base: TorqueModel) -> RestoredState:
+    """Return the state of a version as trained, with the time constants that apply then."""
+    start = log.start_of(session, model, version)
+    online = _with_memory(OnlineModel.start(base), log.memory(session, model, start))
+    return RestoredState(model, version, start, online, start, start)
+
+
+def fold_page(database: Database, known: RestoredState, last: int) -> RestoredState:
+    """Return the state after the next page of the events that are in the log, up to number `last`."""
+    with database.session() as session:
+        events, end = _page(session, known, last)
+    return replace(known, online=_fold_events(known.online, events, None), number=end)
 
 
 def _page(session: Session, known: RestoredState, last: int) -> tuple[Sequence[EventRow], int]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lipcore.online.batch import Rows
+from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.storage.database import Database
 from service.storage.files import Files
@@ -50,6 +51,7 @@ def outcome(tmp_path_factory):
     with Server(home) as server:
         after = server.client.post("/v1/models/pendulum/predict", json=QUERY).json()
         at_the_end = ended(server.client, name)
+        assert verify_home(Settings(home=home)).damages == []
         return KillAndRestart(
             before,
             after,
@@ -121,6 +123,7 @@ def send_stream(home: Path, kills: bool) -> Stream:
             revision = max(revision, last["revision"])  # a batch sent again has the revision of its first time
         model.wait_for_revision(revision)
         answer = model.predict(remembering.query_along())
+        assert verify_home(settings).damages == []
     logged = remembering.read_stream(database)
     database.close()
     return Stream(logged, answer)

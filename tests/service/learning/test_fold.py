@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from lipcore.online import transfer
 from lipcore.online.transfer import Revision
+from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal import restore as restoring
@@ -126,6 +127,7 @@ class LearningMachine(RuleBasedStateMachine):
             return
         with self.resources:
             states = [self._followed(self.known)]
+            assert verify_home(self.arm.settings).damages == []
             for _ in ("newest snapshot", "no snapshot"):
                 self.restart()
                 states.append(self._followed(self.known))

@@ -1,6 +1,5 @@
 """The writes that a service has acknowledged, and checks that it has all of them, whole and once."""
 
-import hashlib
 import sqlite3
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -16,6 +15,8 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import Code
 from lipserve.states import ACTIVE
+from service.cli.verify import verify_home
+from service.foundation.settings import Settings
 from tests.service.data import eventually, job, stream
 from tests.system.faults.injection import TIMEOUT_S
 
@@ -64,20 +65,17 @@ class Ledger:
         eventually(
             lambda: client.get("/health/ready").status_code == 200, TIMEOUT_S
         )  # killed processes are restarted first
-        self._verify_uploads(client, home)
+        self._verify_uploads(client)
         self._verify_jobs(client)
         self._verify_versions(client, arm)
         if arm:
             self._verify_learning(client, home)
         verify_files(home)
-        verify_database(home)
+        assert verify_home(Settings(home=home)).damages == []
 
-    def _verify_uploads(self, client: httpx.Client, home: Path) -> None:
+    def _verify_uploads(self, client: httpx.Client) -> None:
         found = {each["id"]: each for each in list_items(client, "/v1/datasets")}
-        assert found == self.datasets
-        for name, each in found.items():
-            payload = (home / "datasets" / f"{name}.safetensors").read_bytes()
-            assert hashlib.sha256(payload).hexdigest() == each["sha256"]
+        assert found == self.datasets  # `verify` compares the files with the sha256 of the database
         assert {each["id"]: each for each in list_items(client, "/v1/robots")} == self.robots
 
     def _verify_jobs(self, client: httpx.Client) -> None:
@@ -158,12 +156,6 @@ def verify_files(home: Path) -> None:
         eventually(
             lambda at=home / folder, by=query: file_names(at) == {row[0] for row in query_rows(home, by)}, TIMEOUT_S / 5
         )
-
-
-def verify_database(home: Path) -> None:
-    """Check the integrity of the database."""
-    assert query_rows(home, "PRAGMA integrity_check") == [("ok",)]
-    assert query_rows(home, "PRAGMA foreign_key_check") == []
 
 
 def file_names(folder: Path) -> set[str]:

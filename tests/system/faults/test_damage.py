@@ -11,13 +11,14 @@ from fastapi.testclient import TestClient
 
 from lipcore.files.persistence import MANIFEST, TENSORS
 from service.app import create_app
+from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.storage.database.engine import FILE
 from service.storage.storage import HomeError, check_home
 from tests.service.data import error, eventually, stream, upload
 from tests.system.faults.damage import HARM, cut, empty, flip, zero
 from tests.system.faults.harness import populate_home
-from tests.system.faults.ledger import ARM, Ledger, batch, list_items, predict_queries, query_rows, verify_database
+from tests.system.faults.ledger import ARM, Ledger, batch, list_items, predict_queries, query_rows
 
 BATCHES = 12
 ADDRESS = "http://127.0.0.1"
@@ -135,7 +136,8 @@ def test_power_cut_during_commit_loses_only_end_of_log(used_home, home_after_pow
     with journal.open("r+b") as file:
         file.truncate(int(journal.stat().st_size * part))
     check_home(Settings(home=home_after_power_cut))
-    verify_database(home_after_power_cut)
+    found = verify_home(Settings(home=home_after_power_cut))  # files may be lost with the rows that deleted them
+    assert {each.kind for each in found.damages} <= {"snapshot"}
     left = [
         row[0]
         for row in query_rows(home_after_power_cut, "SELECT sequence FROM events WHERE kind = 'batch' ORDER BY number")

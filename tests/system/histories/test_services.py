@@ -14,6 +14,7 @@ import pytest
 import lipcore
 from lipcore.online.learner import OnlineModel
 from service.api.access import keys
+from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.journal import log
 from service.storage.database import Database, VersionRow
@@ -95,6 +96,7 @@ class ServiceGroup:
         assert find_faulty_answers(history.answers, ExpectedTorque(self.settings, self.trained)) == []
         self._check_log()
         self._check_jobs()
+        assert verify_home(self.settings).damages == []
         return counts
 
     def _check_log(self) -> None:

@@ -5,13 +5,16 @@ import json
 from functools import partial
 
 import pytest
-from sqlalchemy import select, update
+from sqlalchemy import delete, select, update
 
 import lipcore
 from lipcore import ModelFormatError
+from lipcore.online import transfer
+from lipcore.online.learner import OnlineModel
 from service.cli.verify import verify_home
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
+from service.journal import log
 from service.models import registry
 from service.storage.database import DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.files import Files
@@ -76,7 +79,7 @@ def store(arm):
 def test_whole_store_is_reported_whole(store):
     found = verify_home(store.settings)
     assert found.damages == []
-    assert found.read == {"datasets": 1, "robots": 1, "versions": 1, "snapshots": 1, "observations": 1}
+    assert found.read == {"datasets": 1, "robots": 1, "versions": 1, "snapshots": 1, "observations": 1, "models": 1}
     spoil_row(SnapshotRow, sha256=None)(store)  # a snapshot without a checksum is read
     assert verify_home(store.settings).damages == []
 
@@ -103,12 +106,58 @@ DAMAGES = {
 }
 
 
+def drop_event(store):
+    """Lose a batch that the snapshot contains, as SQLite does not: the log has a gap."""
+    store.log_batches(1, 2)
+    with store.database.transaction() as session:
+        session.execute(delete(EventRow).where(EventRow.number == 2))
+
+
+def change_row(store):
+    """Change one torque in the log by 0.1 N·m: the snapshot has learnt another one."""
+    rows = log.rows_of(store.find(1))
+    rows.tau[3, 0] += 0.1
+    spoil_row(EventRow, payload=log.encode(rows))(store)
+
+
+def exchange_snapshot(store):
+    """Replace the snapshot by the state as trained, with a correct checksum."""
+    payload = transfer.dump(OnlineModel.start(store.base))
+    next(store.files.learning.glob("snap_*")).write_bytes(payload)
+    spoil_row(SnapshotRow, sha256=hashlib.sha256(payload).hexdigest())(store)
+
+
+DAMAGES |= {
+    "snapshot of other rows": change_row,
+    "snapshot exchanged": exchange_snapshot,
+    "snapshot without an undo": spoil_row(EventRow, void=True),
+    "model's log": drop_event,
+}
+
+
 @pytest.mark.parametrize("what", DAMAGES)
 def test_each_damage_is_the_only_one_found(store, what):
     DAMAGES[what](store)
     (damage,) = verify_home(store.settings).damages
     assert damage.kind == what.split("'")[0].split()[0]
     assert damage.reason
+
+
+def test_log_without_its_oldest_events_is_whole(arm):
+    """Retention has deleted event 1, so event 2 cannot be unlearnt: both snapshots still contain it."""
+    arm.log_batches(0, 1, 2)
+    arm.store_snapshot()
+    arm.log_batches(3, 4)
+    arm.store_snapshot()
+    with arm.database.transaction() as session:
+        session.execute(delete(EventRow).where(EventRow.number == 1))
+    arm.unlearn(2)
+    found = verify_home(arm.settings)
+    assert (found.damages, found.read["snapshots"]) == ([], 2)
+    with arm.database.transaction() as session:  # the later snapshot has learnt another batch
+        other = log.encode(log.rows_of(arm.find(4)))
+        session.execute(update(EventRow).where(EventRow.number == 5).values(payload=other))
+    assert [each.kind for each in verify_home(arm.settings).damages] == ["snapshot"]
 
 
 def test_command_lists_damage_and_exits_with_1(store, lipserve, monkeypatch):
