@@ -42,6 +42,16 @@ def batch(sequence: int) -> dict[str, Any]:
     }
 
 
+FOLDERS = {
+    "datasets": "SELECT id || '.safetensors' FROM datasets UNION SELECT id || '.recording' FROM datasets "
+    "WHERE json_extract(report, '$.upload_options') IS NOT NULL",
+    "versions": "SELECT folder FROM versions",
+    "learning": "SELECT id || '.safetensors' FROM snapshots",
+    "uploads": "SELECT id FROM datasets WHERE 0",
+}
+"""Folders of a home, and queries of the files that rows name."""
+
+
 @dataclass
 class Ledger:
     """Acknowledged writes.
@@ -147,12 +157,7 @@ class Ledger:
 
 def verify_files(home: Path) -> None:
     """Check that the home has exactly the files that rows name; temporary files may exist for a while."""
-    for folder, query in (
-        ("datasets", "SELECT id || '.safetensors' FROM datasets"),
-        ("versions", "SELECT folder FROM versions"),
-        ("learning", "SELECT id || '.safetensors' FROM snapshots"),
-        ("uploads", "SELECT id FROM datasets WHERE 0"),
-    ):
+    for folder, query in FOLDERS.items():
         eventually(
             lambda at=home / folder, by=query: file_names(at) == {row[0] for row in query_rows(home, by)}, TIMEOUT_S / 5
         )

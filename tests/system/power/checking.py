@@ -31,15 +31,8 @@ from service.storage.database import (
 from service.storage.files import Files
 from service.storage.files.store import start_sweeping, sweep_unnamed
 from service.storage.storage import check_home
-from tests.system.faults.ledger import MAX_RELATIVE_DIFFERENCE, file_names, query_rows
+from tests.system.faults.ledger import FOLDERS, MAX_RELATIVE_DIFFERENCE, file_names, query_rows
 from tests.system.power.scenarios import ANY, digest
-
-FOLDERS = {
-    "datasets": "SELECT id || '.safetensors' FROM datasets",
-    "versions": "SELECT folder FROM versions",
-    "learning": "SELECT id || '.safetensors' FROM snapshots",
-    "uploads": "SELECT id FROM datasets WHERE 0",
-}
 
 
 @dataclass
