@@ -22,7 +22,7 @@ from service.storage.database import Database, EventRow
 MAX_DIFFERENCE = 1e-6
 """Largest difference of an array from the stored one, relative to its largest number.
 
-The same processor and release compute the same bits. Others round differently, by 1e-9 at most in our tests.
+The same processor and release compute the same bits. Others may round differently.
 """
 
 
