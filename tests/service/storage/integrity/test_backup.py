@@ -87,15 +87,15 @@ class BackgroundClients:
         self.sent.append(sequence)
 
     def publish(self) -> None:
-        """Import two versions, and delete the second."""
-        for keep in (True, False):
+        """Import two versions, and delete the first, which has stopped serving."""
+        made = []
+        for _ in range(2):
             answer = self.server.client.post("/v1/models/import?name=copy", content=self._archive, headers=TAR)
             assert answer.status_code == 201, answer.text
-            version = answer.json()["version"]
-            self.versions.add(version)
-            if not keep:
-                assert self.server.client.delete(f"/v1/models/copy/versions/{version}").status_code == 204
-                self.deleted.add(version)
+            made.append(answer.json()["version"])
+            self.versions.add(made[-1])
+        assert self.server.client.delete(f"/v1/models/copy/versions/{made[0]}").status_code == 204
+        self.deleted.add(made[0])
 
     def train(self) -> None:
         """Queue a job without waiting for it, up to a few times."""
