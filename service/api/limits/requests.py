@@ -61,6 +61,10 @@ def body_limit(limits: Mapping[str, int], path: str) -> int:
     return limits.get(path) or limits.get(path.rpartition("/")[2]) or limits["*"]
 
 
+WITHOUT_BODY = ("GET", "HEAD")
+"""Methods whose bodies mean nothing. They are ignored."""
+
+
 class BodyLimit:
     """Middleware that rejects too large, too slow and too many request bodies.
 
@@ -89,6 +93,9 @@ class BodyLimit:
         """Pass the request on. Reading its body raises HTTPException with 413, 408 or 429."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
+            return
+        if scope["method"] in WITHOUT_BODY:
+            await self.app(scope, _ignoring_body(receive), send)
             return
         limit = body_limit(self.limits, scope["path"])
         refused = False
@@ -148,6 +155,17 @@ class BodyLimit:
         self._scheduled = None
         if self._due:
             self._schedule_check()
+
+
+def _ignoring_body(receive: Receive) -> Receive:
+    """Return a function that waits for the client to disconnect. An error would end an answer that has begun."""
+
+    async def disconnected() -> Message:
+        while (message := await receive())["type"] == "http.request":
+            pass
+        return message
+
+    return disconnected
 
 
 def _too_large(limit: int) -> HTTPException:

@@ -18,9 +18,9 @@ def limit(app, seconds=LONG, bytes_per_s=1e9, max_bytes=100, at_once=100):
     return BodyLimit(app, {"/large": 1000, "*": max_bytes}, seconds, bytes_per_s, at_once)
 
 
-def scope(path="/", length=None, client="192.0.2.1"):
+def scope(path="/", length=None, client="192.0.2.1", method="POST"):
     headers = [] if length is None else [(b"content-length", str(length).encode())]
-    return {"type": "http", "path": path, "headers": headers, "client": (client, 1)}
+    return {"type": "http", "method": method, "path": path, "headers": headers, "client": (client, 1)}
 
 
 def client_sending(*pieces, more=False):
@@ -63,6 +63,21 @@ def test_max_body_size_depends_on_the_path(path, max_bytes):
         refused = refusal(limit(read_body), scope(path, length), client_sending(*pieces))
         assert refused.status_code == 413
         assert str(max_bytes) in refused.detail
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD"])
+def test_body_of_a_request_without_one_is_ignored(method):
+    """It reaches no limit, because a long answer may have begun."""
+    sent, seen = [bytes(1000), bytes(1000)], []
+
+    async def receive():
+        return {"type": "http.request", "body": sent.pop(), "more_body": True} if sent else {"type": "http.disconnect"}
+
+    async def answer(_, receive, __):
+        seen.append(await receive())
+
+    run_middleware(limit(answer), scope(length=2000, method=method), receive)
+    assert (seen, sent) == ([{"type": "http.disconnect"}], [])
 
 
 @pytest.mark.parametrize("pieces", [(), (b"a",), (b"a", b"b")], ids=["nothing", "one piece", "two pieces"])
