@@ -281,12 +281,21 @@ def _read_document(text: bytes) -> tuple[Iterator[Any], tuple[str, ...] | None, 
 def _items(text: bytes) -> list[Any] | Iterator[Any]:
     """Return the items of an array, each decoded when it is used if that is possible."""
     try:
-        return (msgspec.json.decode(each) for each in msgspec.json.decode(text, type=list[msgspec.Raw]))
+        return _decode_items(msgspec.json.decode(text, type=list[msgspec.Raw]))
     except (msgspec.DecodeError, RecursionError):
         items = decode(text)
         if type(items) is not list:
             raise ValueError("not an array") from None
         return items
+
+
+def _decode_items(items: list[msgspec.Raw]) -> Iterator[Any]:
+    """Return the items of an array one by one; raise InvalidDataError for a number of too many digits."""
+    for number, item in enumerate(items, start=1):
+        try:
+            yield decode(bytes(item))
+        except ValueError as error:
+            raise invalid_data(f"row {number}", f"not JSON: {error}", "one JSON object") from None
 
 
 def _zip_row(keys: list[str], row: Any) -> Any:

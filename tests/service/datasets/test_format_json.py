@@ -85,6 +85,7 @@ def test_error_names_a_bad_row(tmp_path, number, row, field, message):
         (b'{"t":1,"data":{}}', "json", "file", "an array"),
         (b"[" * 100_000, "json", "file", "not JSON"),
         (b'"text"', "json", "file", "an array"),
+        (b'[{"q":1},{"q":' + b"9" * 5000 + b"}]", "json", "row 2", "4300 digits"),
         (json.dumps([{"q": [0] * 100}]).encode(), "json", "q", "at most 40"),
         (json.dumps([{f"c{i}": 1 for i in range(30)}]).encode(), "json", "columns", "at most 20"),
         (b"[" + b'{"a":' * 11 + b"1" + b"}" * 11 + b"]", "json", "a.a.a", "nested"),
