@@ -203,9 +203,15 @@ def _rows(rows: Rows) -> schema.ObservationRows:
     return schema.ObservationRows(time=finite(rows.time), **vectors, code=[CODES[code] for code in rows.code])
 
 
+MOMENT_RANGE = (-62135596800.0, 253402300799.0)
+"""First and last second that a date has, the years 1 to 9999, Unix time, s."""
+
+
 def _moment(seconds: float) -> str:
     """Return Unix seconds as an ISO time, as in all other responses."""
-    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+    return datetime.fromtimestamp(min(max(seconds, MOMENT_RANGE[0]), MOMENT_RANGE[1]), UTC).isoformat(
+        timespec="milliseconds"
+    )
 
 
 def read_newest_revision(session: Session, model: str, version: int) -> int:

@@ -96,3 +96,11 @@ def test_streams_continue_after_clock_correction_during_downtime(learning_servic
         assert_learnt_completely(learning_model.send_batches(2, 3))
         assert mean_std(learning_model) < earlier_std
         assert learning_model.get("quality")["windows"][0]["rows"] == 20
+
+
+def test_batch_outside_the_calendar_is_listed(learning_service):
+    """Dates end with the year 9999."""
+    learning_model = learning_service.create_model()
+    learning_model.post("observations", shifted_batch(0, by=1e300))
+    (shown,) = learning_model.get("observations")["items"]
+    assert (shown["first_at"][:4], shown["last_at"][:4]) == ("9999", "9999")
