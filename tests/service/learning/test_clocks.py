@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 
+from service.learning.control import status
 from tests.service.learning.learning_models import LearningModel, observation_batch, start_service
 
 YEAR_S = 365 * 86400.0
@@ -98,9 +99,6 @@ def test_streams_continue_after_clock_correction_during_downtime(learning_servic
         assert learning_model.get("quality")["windows"][0]["rows"] == 20
 
 
-def test_batch_outside_the_calendar_is_listed(learning_service):
-    """Dates end with the year 9999."""
-    learning_model = learning_service.create_model()
-    learning_model.post("observations", shifted_batch(0, by=1e300))
-    (shown,) = learning_model.get("observations")["items"]
-    assert (shown["first_at"][:4], shown["last_at"][:4]) == ("9999", "9999")
+@pytest.mark.parametrize(("seconds", "text"), [(-1e300, "0001-01-01T00:00:00"), (1e300, "9999-12-31T23:59:59")])
+def test_times_outside_the_calendar_get_the_nearest_date(seconds, text):
+    assert status._moment(seconds) == f"{text}.000+00:00"
