@@ -25,6 +25,7 @@ from service.api.access.scopes import ADMIN, SCOPES
 from service.api.limits.requests import Rate
 from service.foundation.errors import InvalidRequestError, RateLimitedError, UnauthorizedError
 from service.foundation.fields import check_name
+from service.foundation.text import iso_time
 from service.storage.database import ApiKeyRow, Database, now
 from service.storage.files import new_id
 
@@ -151,8 +152,7 @@ def note_used(database: Database, seen: Mapping[str, float]) -> None:
     """Store the last use of keys: Unix times in s by key id."""
     with database.transaction() as session:
         for key, at in seen.items():
-            text = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds")
-            session.execute(update(ApiKeyRow).where(ApiKeyRow.id == key).values(used_at=text))
+            session.execute(update(ApiKeyRow).where(ApiKeyRow.id == key).values(used_at=iso_time(at)))
 
 
 def key_of(row: ApiKeyRow) -> Key:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from service.contract.payload import (
     Vector,
 )
 from service.foundation.errors import ConflictError, NotFoundError, invalid_request, problem
+from service.foundation.text import iso_time
 from service.journal import log
 from service.learning import owner
 from service.learning.ingest.monitor import Monitor
@@ -159,7 +159,7 @@ def _carrying_fields(stream_id: str, watch: PayloadTracker) -> dict[str, Any]:
         "stream_id": stream_id,
         "state": watch.state,
         "declared": held is not None and held.declared,
-        "since": None if since is None else datetime.fromtimestamp(since, UTC).isoformat(timespec="milliseconds"),
+        "since": None if since is None else iso_time(since),
         "rows": 0 if held is None else held.count,
     }
 

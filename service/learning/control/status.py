@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import select
@@ -19,6 +18,7 @@ from service.contract.observations import ObservationResponse
 from service.contract.verdict import Verdict
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
+from service.foundation.text import iso_time
 from service.journal import log, snapshots
 from service.journal.arrivals import is_forgotten
 from service.learning import owner
@@ -110,7 +110,7 @@ def _streams(session: Session, model: str) -> list[schema.Stream]:
             stream_id=row.stream_id,
             kind=row.kind,
             last=row.last,
-            last_at=None if row.received is None else _moment(row.received),
+            last_at=None if row.received is None else iso_time(row.received),
             offset_s=row.offset,
             gaps=row.missing["ranges"][-MAX_GAPS:],
             missing=sum(last - first + 1 for first, last in row.missing["ranges"]),
@@ -175,9 +175,9 @@ def _outline(session: Session, event: EventRow) -> dict[str, Any]:
         "last_sequence": event.last_sequence,
         "event": event.number,
         "state": read_state(session, event),
-        "received_at": _moment(event.received),
-        "first_at": None if event.first is None else _moment(event.first),
-        "last_at": None if event.last is None else _moment(event.last),
+        "received_at": iso_time(event.received),
+        "first_at": None if event.first is None else iso_time(event.first),
+        "last_at": None if event.last is None else iso_time(event.last),
         "version": event.version,
         "revision": event.revision,
         "rows": (event.report or {}).get("rows", event.rows),
@@ -191,7 +191,7 @@ def _replay(session: Session, batch: EventRow, event: EventRow) -> schema.Replay
     undone = read_state(session, batch) if batch.void else "rolled_back"
     return schema.Replay(
         event=event.number,
-        replayed_at=_moment(event.received),
+        replayed_at=iso_time(event.received),
         state=undone if event.void else "learnt",
         codes=(event.detail or {})["codes"],
         rows=event.rows,
@@ -201,17 +201,6 @@ def _replay(session: Session, batch: EventRow, event: EventRow) -> schema.Replay
 def _rows(rows: Rows) -> schema.ObservationRows:
     vectors = {name: [finite(row) for row in getattr(rows, name)] for name in ("q", "dq", "ddq", "tau")}
     return schema.ObservationRows(time=finite(rows.time), **vectors, code=[CODES[code] for code in rows.code])
-
-
-MOMENT_RANGE = (-62135596800.0, 253402300799.0)
-"""First and last second that a date has, the years 1 to 9999, Unix time, s."""
-
-
-def _moment(seconds: float) -> str:
-    """Return Unix seconds as an ISO time, as in all other responses."""
-    return datetime.fromtimestamp(min(max(seconds, MOMENT_RANGE[0]), MOMENT_RANGE[1]), UTC).isoformat(
-        timespec="milliseconds"
-    )
 
 
 def read_newest_revision(session: Session, model: str, version: int) -> int:

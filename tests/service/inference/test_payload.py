@@ -100,7 +100,7 @@ def test_model_without_an_arm_rejects_a_payload(api, trained, rows):
     answer = predict(api, trained.name, **query, payload=POINT)
     (problem,) = error(answer, 422, "invalid_request")["detail"]
     assert (problem["field"], problem["value"]) == ("payload", "given")
-    assert problem["expected"].startswith("no payload, or a model of estimator rigid-body")
+    assert problem["expected"].startswith("no payload, or a model of one arm, of estimator rigid-body")
     assert predict_json(api, trained.name, **query, payload=None)
 
 

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from service.learning.control import status
+from service.foundation.text import iso_time
 from tests.service.learning.learning_models import LearningModel, observation_batch, start_service
 
 YEAR_S = 365 * 86400.0
@@ -101,4 +101,4 @@ def test_streams_continue_after_clock_correction_during_downtime(learning_servic
 
 @pytest.mark.parametrize(("seconds", "text"), [(-1e300, "0001-01-01T00:00:00"), (1e300, "9999-12-31T23:59:59")])
 def test_times_outside_the_calendar_get_the_nearest_date(seconds, text):
-    assert status._moment(seconds) == f"{text}.000+00:00"
+    assert iso_time(seconds) == f"{text}.000+00:00"
