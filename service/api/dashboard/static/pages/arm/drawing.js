@@ -81,7 +81,7 @@ class Arm {
 
   traces({ turned, masses }) {
     const { order } = this.geometry;
-    const links = armPaths(this.geometry.joints, turned.map((each) => each.origin)).flatMap((each) => [...each, null]);
+    const links = armPaths(this.geometry.joints, turned.map((each) => each.origin)).flatMap((each) => [...each, null]).slice(0, -1);
     const arms = turned.flatMap(({ origin }, place) => [origin, masses[place], null]);
     const half = AXIS * this.size;
     const balls = order.map((joint) => this.masses[joint]);
