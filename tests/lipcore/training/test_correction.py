@@ -5,6 +5,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from scipy import optimize
 from scipy.spatial.distance import cdist
 
 from lipcore import FitOptions, Samples, TorquePrediction, load, save, train
@@ -184,13 +185,14 @@ def test_correction_learns_more_rows_than_its_centres_are_chosen_from(monkeypatc
 @pytest.mark.slow
 def test_refit_starts_at_the_lengthscales_of_the_fit_before(local_and_arm, monkeypatch):
     samples, local = simulate_ripple(), local_and_arm[0]
-    search = Mock(side_effect=lengthscales.minimize)
-    monkeypatch.setattr(lengthscales, "minimize", search)
+    search = Mock(side_effect=optimize.minimize)
+    monkeypatch.setattr(optimize, "minimize", search)
     refit(local, make_task(samples))
     inputs = residual_inputs(samples.motion())
     before = local.posterior.basis.residual.joints[RIPPLED_JOINT].lengthscales
     expected = np.log(before / (inputs.std(axis=0) * np.sqrt(inputs.shape[1])))
-    starts = [call.args[1][:-2] for call in search.call_args_list]
+    logs = [call.args[1] for call in search.call_args_list]  # those of the arm have another size
+    starts = [each[:-2] for each in logs if len(each) == len(expected) + 2]
     assert sum(np.allclose(start, expected) for start in starts) == 1
     assert len(starts) == 1 + 2 * len(lengthscales.OPTIONS.starts)  # the other joints have no residual
 
@@ -222,7 +224,7 @@ def test_fast_answers_use_fewer_centres_and_state_their_error(local_and_arm, mon
     monkeypatch.setattr(centres, "OPTIONS", replace(centres.OPTIONS, features=8, fast=12))
     local, again = train_corrected(simulate_ripple()), simulate_ripple(8.0, start=100.0, seed=1)
     rich, fast, arm = (rmse_per_joint(each, again)[RIPPLED_JOINT] for each in (local, local.fast, local_and_arm[1]))
-    assert rich < 0.8 * fast < 0.8 * arm
+    assert rich < 0.9 * fast < 0.9 * 0.8 * arm
     shares = [local.fit[f"{prefix}local_{RIPPLED_JOINT + 1}"] for prefix in ("", "fast_")]
     assert shares == pytest.approx(np.square(np.array([rich, fast]) / arm), rel=0.5)
     assert (predict(local.fast, again).interval.contains(again.tau).mean(axis=0) > 0.9).all()

@@ -53,7 +53,7 @@ def test_refit_learns_unseen_rows(estimator):
     task, part = fit_first_part(simulate_resting_joint(), estimator)
     part = replace(part, selection=selection(estimator, "it was chosen", []))
     whole = refit(part, task)
-    assert nmse(whole, simulate_unseen())[2] < 0.5 * nmse(part, simulate_unseen())[2]
+    assert nmse(whole, simulate_unseen())[2] < 0.6 * nmse(part, simulate_unseen())[2]
     assert whole.estimator.name == part.estimator.name
     assert whole.selection == part.selection
     assert (part.fit["samples_given"], whole.fit["samples_given"]) == (CUT, 200)
