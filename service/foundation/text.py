@@ -1,17 +1,6 @@
-"""Numbers and times as text for sentences, tables and responses."""
+"""Numbers as text for sentences and tables."""
 
 from __future__ import annotations
-
-from datetime import UTC, datetime
-
-MOMENT_RANGE = (-62135596800.0, 253402300799.0)
-"""First and last second that a date has, the years 1 to 9999, Unix time, s."""
-
-
-def iso_time(seconds: float) -> str:
-    """Format Unix seconds as an ISO time in milliseconds, the nearest that exists."""
-    within = min(max(seconds, MOMENT_RANGE[0]), MOMENT_RANGE[1])
-    return datetime.fromtimestamp(within, UTC).isoformat(timespec="milliseconds")
 
 
 def percent(share: float, digits: int = 0) -> str:

@@ -25,8 +25,7 @@ from service.api.access.scopes import ADMIN, SCOPES
 from service.api.limits.requests import Rate
 from service.foundation.errors import InvalidRequestError, RateLimitedError, UnauthorizedError
 from service.foundation.fields import check_name
-from service.foundation.text import iso_time
-from service.storage.database import ApiKeyRow, Database, now
+from service.storage.database import ApiKeyRow, Database, iso_time, now
 from service.storage.files import new_id
 
 PREFIX = "lip_"

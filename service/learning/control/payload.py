@@ -27,13 +27,13 @@ from service.contract.payload import (
     Vector,
 )
 from service.foundation.errors import ConflictError, NotFoundError, invalid_request, problem
-from service.foundation.text import iso_time
 from service.journal import log
 from service.learning import owner
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.models.served import ServedModel
 from service.storage import audit
+from service.storage.database import iso_time
 
 INERTIA_DRAWS = 500
 """Draws of a payload's parameters for the standard deviation of its inertia."""

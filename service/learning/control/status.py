@@ -18,7 +18,6 @@ from service.contract.observations import ObservationResponse
 from service.contract.verdict import Verdict
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
-from service.foundation.text import iso_time
 from service.journal import log, snapshots
 from service.journal.arrivals import is_forgotten
 from service.learning import owner
@@ -27,7 +26,7 @@ from service.learning.learners import Learners
 from service.models import registry, verdicts
 from service.models.exports import list_exports
 from service.models.served import ServedModel
-from service.storage.database import EventRow, StreamRow
+from service.storage.database import EventRow, StreamRow, iso_time
 from service.storage.rows import Page
 
 Range = tuple[int, int]

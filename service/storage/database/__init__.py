@@ -22,6 +22,7 @@ from service.storage.database.tables import (
     SnapshotRow,
     StreamRow,
     VersionRow,
+    iso_time,
     now,
 )
 
@@ -48,5 +49,6 @@ __all__ = [
     "StreamRow",
     "VersionRow",
     "fetch",
+    "iso_time",
     "now",
 ]

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from service.foundation.text import iso_time
+from service.storage.database import iso_time
 from tests.service.learning.learning_models import LearningModel, observation_batch, start_service
 
 YEAR_S = 365 * 86400.0
