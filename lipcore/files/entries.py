@@ -112,7 +112,7 @@ class Joint(JointPose):
     plausible: JointPose | UnsetType = UNSET
     """Pose for the plausible bodies, if it differs."""
     root: bool | UnsetType = UNSET
-    """True for the first joint of a further arm, whose pose is in the base's frame."""
+    """Whether this is the first joint of the second arm or a later one. Its pose is in the frame of the base."""
 
     def __post_init__(self) -> None:
         for name in ("turn_std", "shift_std"):

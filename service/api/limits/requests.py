@@ -62,7 +62,7 @@ def body_limit(limits: Mapping[str, int], path: str) -> int:
 
 
 WITHOUT_BODY = ("GET", "HEAD")
-"""Methods whose bodies mean nothing. They are ignored."""
+"""Methods whose request bodies are ignored, because they have no meaning."""
 
 
 class BodyLimit:

@@ -16,7 +16,7 @@ MODEL = "two-arms"
 
 @pytest.fixture(scope="module")
 def arms(streaming):
-    """The version of a model of two arms, whose joints the data have in turn."""
+    """Return a server with a model of two arms. In its data, the joints of the arms alternate."""
     api, samples = streaming.server.client, record_two_arms(1)
     answer = api.post("/v1/robots", content=URDF.encode(), headers={"content-type": "application/xml"})
     robot, dataset = answer.json()["id"], upload(api, samples)["id"]
