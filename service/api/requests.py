@@ -121,6 +121,8 @@ def _request_fields(scope: Scope, route: str) -> dict[str, Any]:
     return fields
 
 
+HANDED_OVER = "lipserve.handed_over"
+"""Marks the scope of a request that another process answers."""
 WEBSOCKET = "WEBSOCKET"
 """Stands in for the method of a WebSocket request."""
 
@@ -171,17 +173,20 @@ class RequestContext:
             self.requests.in_flight -= method is not WEBSOCKET
             self.requests.streams -= status == 101
             now = perf_counter()
-            if not status:
-                status, answered = 499, now  # the client disconnected
-            path, seconds = _template(scope), now - began
-            model: str = scope["path_params"].get("model", "") if path else ""
-            kind = (method, path, model, status, scope.get(ERROR_CODE, ""))
-            durations = self.known.get(kind)
-            if durations is None:
-                durations = self.requests.find(Kind(*kind), status < 400 or _exists(scope, model))
-            durations.add(answered - began)
-            if status >= 400 or self.log.may_log(method, path, seconds):
-                self.log.log_end(scope, Kind(*kind), seconds)
+            if HANDED_OVER not in scope:
+                self._count(scope, method, status or 499, began, answered if status else now, now)
+
+    def _count(self, scope: Scope, method: str, status: int, began: float, answered: float, now: float) -> None:
+        """Count and log a request; status 499: the client disconnected."""
+        path, seconds = _template(scope), now - began
+        model: str = scope["path_params"].get("model", "") if path else ""
+        kind = (method, path, model, status, scope.get(ERROR_CODE, ""))
+        durations = self.known.get(kind)
+        if durations is None:
+            durations = self.requests.find(Kind(*kind), status < 400 or _exists(scope, model))
+        durations.add(answered - began)
+        if status >= 400 or self.log.may_log(method, path, seconds):
+            self.log.log_end(scope, Kind(*kind), seconds)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, error: Exception, begun: bool) -> None:
         """Answer a request after an unexpected exception, unless its answer has begun."""

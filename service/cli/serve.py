@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -30,9 +31,14 @@ def serve(
     """Serve models and run training jobs."""
     settings = settings_of(host=host, port=port, grpc_port=grpc_port, uds=uds)
     sockets.check_port(settings.host, settings.port)
-    limit_free_memory()
     start_logs(settings)
     check_home(settings)  # before the app opens it, so that errors are printed without a traceback
+    if settings.data_plane and sys.platform == "linux":
+        from service.planes import supervisor  # noqa: PLC0415
+
+        supervisor.serve(settings)
+        return
+    limit_free_memory()
     served = create_app(settings)
     rpc.check_port(settings)
     config = uvicorn.Config(

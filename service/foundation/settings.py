@@ -127,6 +127,10 @@ class Settings(BaseSettings):
     log_slow_s: Seconds = Field(
         0.25, description="Min duration of a query of a control loop for which it is logged as slow."
     )
+    data_plane: bool = Field(
+        False,
+        description="Answer control loops in a process of their own, which other requests cannot delay. Linux only.",
+    )
     opentelemetry: bool = Field(
         False,
         description="Send a trace of each request to OTEL_EXPORTER_OTLP_ENDPOINT. Needs `lipserve[opentelemetry]`.",

@@ -32,6 +32,9 @@ logger = logging.getLogger(__name__)
 __all__ = ["LoadedModels", "ServedModel"]
 
 
+PRELOADED: dict[str, TorqueModel] = {}
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """Versions in memory, the serving version of each model, and all other aliases; replaced as a whole."""
@@ -71,6 +74,8 @@ class LoadedModels:
         self.storage, self.learnt = storage, learnt
         self.database, self.files = storage.database, storage.files
         self.capacity = storage.settings.max_loaded_models if capacity is None else capacity
+        self.preloaded: Mapping[str, TorqueModel] = PRELOADED
+        """Versions that were loaded before this process was forked, by folder."""
         self.when_deleted: list[Callable[[str], None]] = []
         """Functions called with the name of a deleted model."""
         self._lagging: set[str] = set()
@@ -366,7 +371,7 @@ class LoadedModels:
 
     def _read(self, row: VersionRow) -> TorqueModel:
         try:
-            return self.files.load_version(row.folder, row.checksums)
+            return self.preloaded.get(row.folder) or self.files.load_version(row.folder, row.checksums)
         except lipcore.ModelFormatError as error:
             registry.find(self.database, row.model, row.version)  # it may have been deleted meanwhile
             message = f"version {row.version} of model {row.model!r} cannot be loaded: {error}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from lipcore.model.payload import PayloadPosterior
 from lipcore.model.torque_model import TorqueModel
 from service.models.scales import RECENT_S
 
@@ -19,6 +20,8 @@ class StreamPayload:
     """Mean and standard deviation, kg; None if the stream has no payload."""
     received: float
     """Unix time of the stream's last observation batch, s."""
+    load: PayloadPosterior | None = None
+    """Payload that the model has, for another process that builds it."""
 
 
 class StreamPayloads:

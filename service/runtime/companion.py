@@ -41,6 +41,8 @@ class CompanionOptions:
 COMPANION = CompanionOptions()
 
 
+FORK: Callable[..., Any] | None = None
+"""Forks a process from one that has imported the numerics already; None: start new interpreters. Prototype."""
 BEAT, BEAT_S = "beat", 1.0
 """Message of the process after a step, and the min seconds between two of them."""
 Work = dict[Hashable, list[Any]]
@@ -165,6 +167,10 @@ class Companion:
     def _start(self) -> tuple[Connection, BaseProcess]:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
+        if FORK is not None:
+            forked: BaseProcess = FORK(f"lipserve-{self.name}", (self.place, self._run, self.settings), theirs)
+            theirs.close()
+            return ours, forked
         arguments = self.place, self._run, self.settings, theirs
         process = context.Process(target=_begin, args=arguments, daemon=True, name=f"lipserve-{self.name}")
         process.start()

@@ -31,6 +31,15 @@ _prefix = secrets.token_hex(6)
 _numbers = itertools.count(1)
 
 
+def _renew_prefix() -> None:
+    """Give a forked process ids of its own."""
+    global _prefix  # noqa: PLW0603 - one a process
+    _prefix = secrets.token_hex(6)
+
+
+os.register_at_fork(after_in_child=_renew_prefix)
+
+
 def new_request_id() -> str:
     """Return an id that is unique among all processes; a counter costs less than randomness."""
     return f"{_prefix}-{next(_numbers):x}"

@@ -1,0 +1,1 @@
+"""Two planes: a process that only answers control loops, and one that does everything else."""

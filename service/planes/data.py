@@ -1,0 +1,91 @@
+"""The process of the data plane: it answers control loops and does nothing else."""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from struct import Struct
+from typing import Any
+
+import uvicorn
+from threadpoolctl import threadpool_limits
+
+from service.api.access.keys import REFRESH_S, Keyring
+from service.api.server import sockets
+from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
+from service.foundation.settings import Settings
+from service.planes.answers import DataApp, with_middleware
+from service.planes.handover import DataProtocol
+from service.planes.link import ControlLink
+from service.runtime.process import SERVING_THREADS
+from service.telemetry.meters import Meters
+from service.telemetry.readiness import StopState
+
+logger = logging.getLogger(__name__)
+BEAT = Struct("<QQ")
+"""Process of the data plane, and a number that it counts up."""
+BEAT_S = 0.05
+
+
+def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any) -> None:
+    """Follow the control plane; answer once no other data plane lives."""
+    sys.setswitchinterval(3e-5)
+    threadpool_limits(SERVING_THREADS)
+    from lipcore.posterior.threads import limit_threads  # noqa: PLC0415 - the numerics
+
+    limit_threads(SERVING_THREADS)
+    keyring = Keyring(REFRESH_S, settings.max_request_burst) if settings.keys_needed else None
+    control, meters = ControlLink(settings, link, keyring), Meters()
+    control.published.wait()
+    held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
+    fcntl.flock(held, fcntl.LOCK_EX)  # the kernel frees it the moment the process that held it is gone
+    logger.info("process %d is the data plane", os.getpid())
+    app = DataApp(control, meters)
+    made: Any = type("DataConnection", (DataProtocol,), {"send": staticmethod(control.pass_on)})
+    limited = guarded(settings)
+    made.patience, made.limit = limited.patience, limited.limit
+    config = uvicorn.Config(
+        with_middleware(app, settings, keyring, meters),
+        log_config=None,
+        access_log=False,
+        loop="uvloop",
+        http=made,
+        ws=StreamProtocol,
+        ws_max_size=MAX_FRAME_BYTES,
+        ws_per_message_deflate=False,
+        timeout_keep_alive=settings.keep_alive_s,
+        timeout_graceful_shutdown=sockets.DRAIN_S,
+        forwarded_allow_ips=settings.trusted_proxies,
+        lifespan="off",
+    )
+    server = _Server(config, None, StopState(), settings.stop_notice_s)
+
+    def begin() -> None:
+        control.start(lambda first: _adopted(server, made, first))
+        beat(1)
+
+    def beat(number: int) -> None:
+        BEAT.pack_into(beats, 0, os.getpid(), number)
+        asyncio.get_running_loop().call_later(BEAT_S, beat, number + 1)
+
+    server.begun = begin
+    server.run([listener])
+
+
+def _adopted(server: _Server, base: Any, first: bytes) -> Callable[[], asyncio.Protocol]:
+    kind: Any = type("AdoptedConnection", (base,), {"first": first})
+    kind.limit = base.limit
+    return lambda: kind(config=server.config, server_state=server.server_state, app_state=server.lifespan.state)
+
+
+class _Server(sockets.Server):
+    begun: Callable[[], None]
+
+    async def startup(self, sockets: Any = None) -> None:
+        await super().startup(sockets)
+        self.begun()
