@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from struct import Struct
 from typing import Any
@@ -17,10 +18,10 @@ from threadpoolctl import threadpool_limits
 
 from service.api.access.keys import REFRESH_S, Keyring
 from service.api.server import sockets
-from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
+from service.api.server.connections import MAX_FRAME_BYTES, guarded
 from service.foundation.settings import Settings
 from service.planes.answers import DataApp, with_middleware
-from service.planes.handover import DataProtocol
+from service.planes.connections import DataProtocol, DataStream
 from service.planes.link import ControlLink
 from service.runtime.process import SERVING_THREADS
 from service.telemetry.meters import Meters
@@ -45,17 +46,15 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any) -
     held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
     fcntl.flock(held, fcntl.LOCK_EX)  # the kernel frees it the moment the process that held it is gone
     logger.info("process %d is the data plane", os.getpid())
-    app = DataApp(control, meters)
-    made: Any = type("DataConnection", (DataProtocol,), {"send": staticmethod(control.pass_on)})
-    limited = guarded(settings)
-    made.patience, made.limit = limited.patience, limited.limit
+    app = DataApp(control.learners, meters)
+    made: Any = guarded(settings, kind=DataProtocol, others=control.passed, control=control.pass_on)
     config = uvicorn.Config(
         with_middleware(app, settings, keyring, meters),
         log_config=None,
         access_log=False,
         loop="uvloop",
         http=made,
-        ws=StreamProtocol,
+        ws=type("DataStream", (DataStream,), {"control": control.pass_on}),
         ws_max_size=MAX_FRAME_BYTES,
         ws_per_message_deflate=False,
         timeout_keep_alive=settings.keep_alive_s,
@@ -66,7 +65,7 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any) -
     server = _Server(config, None, StopState(), settings.stop_notice_s)
 
     def begin() -> None:
-        control.start(lambda first: _adopted(server, made, first))
+        control.start(partial(made, config=config, server_state=server.server_state, app_state=server.lifespan.state))
         beat(1)
 
     def beat(number: int) -> None:
@@ -75,12 +74,6 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any) -
 
     server.begun = begin
     server.run([listener])
-
-
-def _adopted(server: _Server, base: Any, first: bytes) -> Callable[[], asyncio.Protocol]:
-    kind: Any = type("AdoptedConnection", (base,), {"first": first})
-    kind.limit = base.limit
-    return lambda: kind(config=server.config, server_state=server.server_state, app_state=server.lifespan.state)
 
 
 class _Server(sockets.Server):
