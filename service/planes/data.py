@@ -47,7 +47,9 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any) -
     fcntl.flock(held, fcntl.LOCK_EX)  # the kernel frees it the moment the process that held it is gone
     logger.info("process %d is the data plane", os.getpid())
     app = DataApp(control.learners, meters)
-    made: Any = guarded(settings, kind=DataProtocol, others=control.passed, control=control.pass_on)
+    made: Any = guarded(
+        settings, kind=DataProtocol, others=control.passed, passed=control.passed, control=control.pass_on
+    )
     config = uvicorn.Config(
         with_middleware(app, settings, keyring, meters),
         log_config=None,
