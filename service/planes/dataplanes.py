@@ -51,7 +51,7 @@ class DataPlanes:
     def close(self) -> None:
         """Stop reporting, and close the channels."""
         self._reporting.cancel()
-        for channel in self._channels:
+        for channel in tuple(self._channels):
             channel.close()
 
     def _receive(self, channel: Channel) -> None:
@@ -101,7 +101,7 @@ class DataPlanes:
         channel.send(self._connections.shed(asked), wait=False)
 
     def _broadcast(self, message: Any) -> None:
-        for channel in self._channels:
+        for channel in tuple(self._channels):
             channel.send(message, wait=False)
 
 

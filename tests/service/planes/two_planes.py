@@ -85,6 +85,7 @@ class TwoPlanes(Serving):
         self.accepting.listen(8)
         self.patience, self.keep = patience, {"timeout_keep_alive": self.settings.keep_alive_s}
         self.keep |= {"timeout_graceful_shutdown": drain_s, "server_header": False, "date_header": False}
+        self.keep["forwarded_allow_ips"] = self.settings.trusted_proxies
         self.server = Server(self._config(self.app), None, self.stopping, notice_s)
         self.link = ControlLink(self.settings, self.folder / "link", None)
         passing = {"passed": self.link.passed, "control": self.link.pass_on}

@@ -132,6 +132,13 @@ class RawConnection:
         self.socket = socket.create_connection(("127.0.0.1", port), DEADLINE)
         self.ahead = b""  # bytes of the next answer
 
+    @classmethod
+    def of(cls, connected: socket.socket) -> "RawConnection":
+        """Return a connection over a socket."""
+        made = cls.__new__(cls)
+        made.socket, made.ahead = connected, b""
+        return made
+
     def send(self, data: bytes) -> None:
         """Send bytes."""
         self.socket.sendall(data)
