@@ -4,42 +4,83 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import multiprocessing
+import os
+import signal
 import socket
+import struct
 import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pickle import PickleBuffer
+from types import FrameType
 from typing import Any
 
 from fastapi import FastAPI
 
 from service.api.server import sockets
+from service.api.server.configuration import configure_server
+from service.app import create_app
 from service.foundation.errors import ServiceError
+from service.foundation.settings import Settings
 from service.learning.ingest.frames import Frames
 from service.learning.learners import Learners
 from service.models.loaded import LoadedModels
 from service.planes.channel import Channel
 from service.planes.handover import ControlProtocol, adopt
 from service.planes.publisher import Publisher
+from service.planes.pulse import BEAT_S, Plane, Pulse
+from service.runtime import nursery
+from service.runtime.allocator import limit_free_memory
 
 logger = logging.getLogger(__name__)
 
 
-class ControlServer(sockets.Server):
-    """uvicorn's server without a port: its connections come from the data plane."""
+def run(settings: Settings, link: socket.socket, pulse: Pulse) -> None:
+    """Serve all routes to the data planes that connect to `link`, until SIGTERM."""
+    nursery.start()
+    multiprocessing.current_process().name = "MainProcess"  # the log does not mention it
+    limit_free_memory()
+    app = create_app(settings)
+    ControlServer(app, settings, link, pulse).run()
 
-    app: FastAPI
-    link: socket.socket
+
+class ControlServer(sockets.Server):
+    """uvicorn's server without a port: its connections come from the data plane.
+
+    The supervisor sends SIGUSR1 when the service begins to stop, and SIGTERM once the data plane has ended.
+    """
+
+    def __init__(self, app: FastAPI, settings: Settings, link: socket.socket, pulse: Pulse) -> None:
+        super().__init__(configure_server(app, settings), None, app.state.stopping, notice_s=0.0)
+        self.app, self.link, self._pulse = app, link, pulse
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Open the application, then accept data planes."""
         await super().startup([])
+        self.app.state.readiness.add("planes", self._pulse.check)
         self._loop = asyncio.get_running_loop()
+        self._loop.add_signal_handler(signal.SIGUSR1, self._announce_stop)
+        self._beat()
         threading.Thread(target=self._accept, daemon=True).start()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop. A second signal changes nothing: the supervisor kills this process."""
+        self.should_exit = True
+
+    def _announce_stop(self) -> None:
+        self.stopping.begun = True
+
+    def _beat(self) -> None:
+        self._pulse.beat(Plane.CONTROL)
+        self._loop.call_later(BEAT_S, self._beat)
 
     def _accept(self) -> None:
         while True:
             connection, _ = self.link.accept()
+            if not is_own(connection):
+                connection.close()
+                continue
             channel = Channel(connection)
             Publisher(self.app, channel).start()
             threading.Thread(target=self._receive, args=(channel,), daemon=True).start()
@@ -65,6 +106,14 @@ class ControlServer(sockets.Server):
         kind: Any = type("ControlConnection", (ControlProtocol,), {"send": staticmethod(send), "first": first})
         kind.patience, kind.limit = base.patience, base.limit
         return lambda: kind(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
+
+
+def is_own(connection: socket.socket) -> bool:
+    """Return whether the process at the other end of a Unix-domain socket has the user of this one."""
+    _, user, _ = struct.unpack(
+        "3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    )
+    return bool(user == os.getuid())
 
 
 def _load(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> None:
