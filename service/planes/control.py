@@ -2,29 +2,83 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import multiprocessing
+import os
+import signal
 import socket
+import struct
 import threading
+from types import FrameType
 
 from fastapi import FastAPI
 
 from service.api.server import sockets
+from service.api.server.configuration import configure_server
+from service.app import create_app
+from service.foundation.settings import Settings
 from service.planes.channel import Channel
 from service.planes.dataplanes import DataPlanes
+from service.planes.pulse import BEAT_S, Plane, Pulse
+from service.runtime import nursery
+from service.runtime.allocator import limit_free_memory
+
+logger = logging.getLogger(__name__)
+
+
+def run(settings: Settings, link: socket.socket, pulse: Pulse) -> None:
+    """Serve all routes to the data planes that connect to `link`, until SIGTERM."""
+    nursery.start()
+    multiprocessing.current_process().name = "MainProcess"  # the log does not mention it
+    limit_free_memory()
+    app = create_app(settings)
+    ControlServer(app, settings, link, pulse).run()
 
 
 class ControlServer(sockets.Server):
-    """uvicorn's server without a port: its connections come from the data plane."""
+    """uvicorn's server without a port: its connections come from the data plane.
 
-    app: FastAPI
-    link: socket.socket
+    The supervisor sends SIGUSR1 when the service begins to stop, and SIGTERM once the data plane has ended.
+    """
+
+    def __init__(self, app: FastAPI, settings: Settings, link: socket.socket, pulse: Pulse) -> None:
+        super().__init__(configure_server(app, settings), None, app.state.stopping, notice_s=0.0)
+        self.app, self.link, self._pulse = app, link, pulse
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Open the application, then accept data planes."""
         await super().startup([])
+        self.app.state.readiness.add("planes", self._pulse.check)
         self._planes = DataPlanes(self.app, self)
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_signal_handler(signal.SIGUSR1, self._announce_stop)
+        self._beat()
         threading.Thread(target=self._accept, daemon=True).start()
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop. A second signal changes nothing: the supervisor kills this process."""
+        self.should_exit = True
+
+    def _announce_stop(self) -> None:
+        self.stopping.begun = True
+
+    def _beat(self) -> None:
+        self._pulse.beat(Plane.CONTROL)
+        self._loop.call_later(BEAT_S, self._beat)
 
     def _accept(self) -> None:
         while True:
             connection, _ = self.link.accept()
+            if not is_own(connection):
+                connection.close()
+                continue
             self._planes.add(Channel(connection))
+
+
+def is_own(connection: socket.socket) -> bool:
+    """Return whether the process at the other end of a Unix-domain socket has the user of this one."""
+    _, user, _ = struct.unpack(
+        "3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    )
+    return bool(user == os.getuid())

@@ -6,81 +6,102 @@ import asyncio
 import fcntl
 import logging
 import os
+import socket
 import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from struct import Struct
-from typing import Any
+from types import FrameType
 
 import uvicorn
 from threadpoolctl import threadpool_limits
 
+from lipcore.posterior.threads import limit_threads
 from service.api.access.keys import REFRESH_S, Keyring
 from service.api.server import sockets
-from service.api.server.connections import MAX_FRAME_BYTES, guarded
+from service.api.server.configuration import configure_server
+from service.api.server.connections import guarded
+from service.api.server.sockets import UnixSocket
 from service.foundation.settings import Settings
 from service.planes.answers import DataApp, with_middleware
 from service.planes.connections import DataProtocol, DataStream
 from service.planes.link import ControlLink
+from service.planes.pulse import BEAT_S, Plane, Pulse
+from service.runtime import forking
 from service.runtime.process import SERVING_THREADS
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import StopState
 
 logger = logging.getLogger(__name__)
-BEAT = Struct("<QQ")
-"""Process of the data plane, and a number that it counts up."""
-BEAT_S = 0.05
+DRAIN_S = 2
+"""Max wait for running requests when the data plane stops, s: they take milliseconds, and streams are closed."""
 
 
-def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any) -> None:
-    """Follow the control plane; answer once no other data plane lives."""
+def run(
+    settings: Settings, listener: socket.socket, unix: UnixSocket | None, link: Path, lock: int, pulse: Pulse
+) -> None:
+    """Follow the control plane; answer once no other data plane lives.
+
+    lock: descriptor of a file. The data plane that answers has locked it; the kernel unlocks it when that process ends.
+    """
     sys.setswitchinterval(3e-5)
     threadpool_limits(SERVING_THREADS)
-    from lipcore.posterior.threads import limit_threads  # noqa: PLC0415 - the numerics
-
     limit_threads(SERVING_THREADS)
     keyring = Keyring(REFRESH_S, settings.max_request_burst) if settings.keys_needed else None
     control, meters = ControlLink(settings, link, keyring), Meters()
     control.published.wait()
-    held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
-    fcntl.flock(held, fcntl.LOCK_EX)  # the kernel frees it the moment the process that held it is gone
-    logger.info("process %d is the data plane", os.getpid())
-    app = DataApp(control.learners, meters)
-    made: Any = guarded(
-        settings, kind=DataProtocol, others=control.passed, passed=control.passed, control=control.pass_on
+    held = os.open(f"/proc/self/fd/{lock}", os.O_RDWR)  # opened anew: a lock belongs to an opened file
+    fcntl.flock(held, fcntl.LOCK_EX)
+    forking.rename("data")
+    wrapped = with_middleware(DataApp(control.learners, meters), settings, keyring, meters)
+    passing: dict[str, Any] = {"passed": control.passed, "control": control.pass_on}
+    http = guarded(settings, kind=DataProtocol, others=control.passed, **passing)
+    ws = type("DataStream", (DataStream,), {"control": control.pass_on})
+    # port 0: uvicorn then logs the port that the system has chosen
+    options: dict[str, Any] = {
+        "http": http,
+        "ws": ws,
+        "port": 0,
+        "lifespan": "off",
+        "timeout_graceful_shutdown": DRAIN_S,
+    }
+    config = configure_server(wrapped, settings, **options)
+    server = DataServer(config, unix, settings.stop_notice_s, pulse)
+    server.when_started = lambda: control.start(
+        partial(http, config=config, server_state=server.server_state, app_state=server.lifespan.state)
     )
-    config = uvicorn.Config(
-        with_middleware(app, settings, keyring, meters),
-        log_config=None,
-        access_log=False,
-        loop="uvloop",
-        http=made,
-        ws=type("DataStream", (DataStream,), {"control": control.pass_on}),
-        ws_max_size=MAX_FRAME_BYTES,
-        ws_per_message_deflate=False,
-        timeout_keep_alive=settings.keep_alive_s,
-        timeout_graceful_shutdown=sockets.DRAIN_S,
-        forwarded_allow_ips=settings.trusted_proxies,
-        lifespan="off",
-    )
-    server = _Server(config, None, StopState(), settings.stop_notice_s)
-
-    def begin() -> None:
-        control.start(partial(made, config=config, server_state=server.server_state, app_state=server.lifespan.state))
-        beat(1)
-
-    def beat(number: int) -> None:
-        BEAT.pack_into(beats, 0, os.getpid(), number)
-        asyncio.get_running_loop().call_later(BEAT_S, beat, number + 1)
-
-    server.begun = begin
     server.run([listener])
 
 
-class _Server(sockets.Server):
-    begun: Callable[[], None]
+class DataServer(sockets.Server):
+    """uvicorn's server on listeners that the supervisor has opened, with a heartbeat."""
 
-    async def startup(self, sockets: Any = None) -> None:
+    when_started: Callable[[], None]
+
+    def __init__(self, config: uvicorn.Config, unix: UnixSocket | None, notice_s: float, pulse: Pulse) -> None:
+        super().__init__(config, unix, StopState(), notice_s)
+        self._pulse = pulse
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to answer."""
         await super().startup(sockets)
-        self.begun()
+        self.when_started()
+        if self._pulse.last_beat(Plane.DATA).pid:
+            logger.warning("process %d is the data plane now", os.getpid())
+        else:
+            self._log_started_message(sockets or ())
+        self._loop = asyncio.get_running_loop()
+        self._beat()
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop; the file of the Unix-domain socket stays for the next data plane."""
+        self.unix = None
+        await super().shutdown(sockets)
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop. A second signal changes nothing: the supervisor kills this process."""
+        self.should_exit = True
+
+    def _beat(self) -> None:
+        self._pulse.beat(Plane.DATA)
+        self._loop.call_later(BEAT_S, self._beat)
