@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import uvicorn
 from threadpoolctl import threadpool_limits
@@ -54,17 +55,11 @@ def run(
     fcntl.flock(held, fcntl.LOCK_EX)
     forking.rename("data")
     wrapped = with_middleware(DataApp(control.learners, meters), settings, keyring, meters)
-    passing: dict[str, Any] = {"passed": control.passed, "control": control.pass_on}
-    http = guarded(settings, kind=DataProtocol, others=control.passed, **passing)
+    ends: dict[str, Any] = {"passed": control.passed, "control": control.pass_on}
+    http = guarded(settings, kind=DataProtocol, others=control.passed, **ends)
     ws = type("DataStream", (DataStream,), {"control": control.pass_on})
     # port 0: uvicorn then logs the port that the system has chosen
-    options: dict[str, Any] = {
-        "http": http,
-        "ws": ws,
-        "port": 0,
-        "lifespan": "off",
-        "timeout_graceful_shutdown": DRAIN_S,
-    }
+    options = {"http": http, "ws": ws, "port": 0, "lifespan": "off", "timeout_graceful_shutdown": DRAIN_S}
     config = configure_server(wrapped, settings, **options)
     server = DataServer(config, unix, settings.stop_notice_s, pulse)
     server.when_started = lambda: control.start(
