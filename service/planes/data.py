@@ -9,6 +9,7 @@ import os
 import socket
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,7 +25,7 @@ from service.api.server.connections import guarded
 from service.api.server.sockets import UnixSocket
 from service.foundation.settings import Settings
 from service.planes.answers import DataApp, with_middleware
-from service.planes.handover import DataProtocol
+from service.planes.connections import DataProtocol, DataStream
 from service.planes.link import ControlLink
 from service.planes.pulse import BEAT_S, Plane, Pulse
 from service.runtime import forking
@@ -53,22 +54,24 @@ def run(
     held = os.open(f"/proc/self/fd/{lock}", os.O_RDWR)  # opened anew: a lock belongs to an opened file
     fcntl.flock(held, fcntl.LOCK_EX)
     forking.rename("data")
-    app = DataApp(control, meters)
-    made: Any = type("DataConnection", (DataProtocol,), {"send": staticmethod(control.pass_on)})
-    limited = guarded(settings)
-    made.patience, made.limit = limited.patience, limited.limit
-    wrapped = with_middleware(app, settings, keyring, meters)
-    # port 0: uvicorn then logs the port that the system has chosen
-    config = configure_server(wrapped, settings, http=made, port=0, lifespan="off", timeout_graceful_shutdown=DRAIN_S)
+    app = DataApp(control.learners, meters)
+    made: Any = guarded(
+        settings, kind=DataProtocol, others=control.passed, passed=control.passed, control=control.pass_on
+    )
+    config = configure_server(
+        with_middleware(app, settings, keyring, meters),
+        settings,
+        http=made,
+        ws=type("DataStream", (DataStream,), {"control": control.pass_on}),
+        port=0,  # uvicorn then logs the port that the system has chosen
+        lifespan="off",
+        timeout_graceful_shutdown=DRAIN_S,
+    )
     server = DataServer(config, unix, settings.stop_notice_s, pulse)
-    server.when_started = lambda: control.start(lambda first: _adopted(server, made, first))
+    server.when_started = lambda: control.start(
+        partial(made, config=config, server_state=server.server_state, app_state=server.lifespan.state)
+    )
     server.run([listener])
-
-
-def _adopted(server: DataServer, base: Any, first: bytes) -> Callable[[], asyncio.Protocol]:
-    kind: Any = type("AdoptedConnection", (base,), {"first": first})
-    kind.limit = base.limit
-    return lambda: kind(config=server.config, server_state=server.server_state, app_state=server.lifespan.state)
 
 
 class DataServer(sockets.Server):

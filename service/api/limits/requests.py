@@ -243,7 +243,7 @@ async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any)
 
 
 COUNTED = "lipserve.counted"
-"""Marks the ASGI scope of a request that was already counted: its key has its own rate."""
+"""Marks the ASGI scope of a request that was already counted: by its key's own rate, or by another process."""
 MIN_CLEANUP_INTERVAL_S = 1.0
 """Min time in s between two clean-ups of clients with full buckets."""
 NETWORK_BITS = 64

@@ -10,7 +10,7 @@ import termios
 from contextlib import suppress
 from http import HTTPStatus
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn import _types as asgi
@@ -23,7 +23,7 @@ from websockets.protocol import State
 
 from service.api.errors import refuse
 from service.api.limits.requests import HEALTH, PATIENCE, ClientPatience
-from service.api.server.connection_limit import ConnectionLimit
+from service.api.server.connection_limit import ConnectionLimit, Excess, OtherConnections
 from service.foundation.errors import BusyError, ErrorBody, ErrorResponse
 from service.foundation.settings import Settings
 
@@ -45,20 +45,32 @@ class GuardedProtocol(HttpToolsProtocol):
         self._upgraded = False  # to a stream, which then reads the socket
         self._known: object = None
         self.peer: str | None = None
+        self.refused = ""  # why requests are answered with 429, if they are
         self._overhead = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept the connection, or refuse it if there are too many and none is idle."""
         super().connection_made(transport)
         self.peer = self.limit.find_peer(self.client)
-        beyond, why = self.limit.admit(self, self.connections)
-        if beyond > MAX_REFUSED_CONNECTIONS:
+        excess = self.admit()
+        if excess.number > MAX_REFUSED_CONNECTIONS:
             transport.abort()
             return
-        if beyond > 0:
-            self.app = _Refusing(self.app, why)
-            self.ws_protocol_class = None
-        self._head = self.loop.call_later(self.patience.header_s, self._late)
+        if excess.number > 0:
+            self.exceed(excess)
+        self._watch_head()
+
+    def admit(self) -> Excess:
+        """Make room for this connection; see `ConnectionLimit.admit`."""
+        return self.limit.admit(self, self.connections)
+
+    def exceed(self, excess: Excess) -> None:
+        """Act on a limit that this connection exceeds."""
+        self.refuse_requests(excess.why)
+
+    def refuse_requests(self, why: str) -> None:
+        """Answer all requests but health with 429."""
+        self.refused, self.app, self.ws_protocol_class = why, _Refusing(self.app, why), None
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the connection and its timers."""
@@ -78,8 +90,7 @@ class GuardedProtocol(HttpToolsProtocol):
         cycle = self.cycle
         if cycle is None or cycle.response_complete:
             # part of a request line and headers, or the rest of a rejected body
-            if self._head is None and not self.transport.is_closing():
-                self._head = self.loop.call_later(self.patience.header_s, self._late)
+            self._watch_head()
         else:
             if self._head is not None:
                 self._cancel_head()
@@ -137,6 +148,10 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def _unsupported_upgrade_warning(self) -> None:
         """Log nothing: clients could fill the log."""
+
+    def _watch_head(self) -> None:
+        if self._head is None and not self.transport.is_closing():
+            self._head = self.loop.call_later(self.patience.header_s, self._late)
 
     def _cancel_head(self) -> None:
         if self._head is not None:
@@ -209,9 +224,22 @@ class _Refusing:
         await refuse(BusyError(f"{self.why} Try again later.", headers=headers), scope, receive, send)
 
 
-def guarded(settings: Settings, patience: ClientPatience = PATIENCE) -> type[GuardedProtocol]:
-    """Return a connection class with the limits of the settings, for `uvicorn.Config(http=...)`."""
-    return type("GuardedProtocol", (GuardedProtocol,), {"patience": patience, "limit": ConnectionLimit(settings)})
+Guarded = TypeVar("Guarded", bound=GuardedProtocol)
+
+
+def guarded(
+    settings: Settings,
+    patience: ClientPatience = PATIENCE,
+    kind: type[Guarded] = GuardedProtocol,  # type: ignore[assignment]
+    others: OtherConnections | None = None,
+    **fields: Any,
+) -> type[Guarded]:
+    """Return a connection class with the limits of the settings, for `uvicorn.Config(http=...)`.
+
+    kind: its base class; others: see `ConnectionLimit`; fields: further class variables.
+    """
+    limit = ConnectionLimit(settings, others)
+    return type(kind.__name__, (kind,), {"patience": patience, "limit": limit, **fields})
 
 
 CONNECTION = "lipserve.connection"
