@@ -12,10 +12,12 @@ from service.api.access.keys import Keyring
 from service.api.access.middleware import KeyAccess, LocalAccess
 from service.api.access.scopes import PREDICT, Rule
 from service.api.errors import refuse
-from service.api.limits.requests import MAX_REQUESTS, Gate, RateLimit
+from service.api.limits.rates import RateLimit
+from service.api.limits.requests import MAX_REQUESTS, Gate
 from service.api.requests import HANDED_OVER, MAX_REFUSALS_PER_S, RequestContext, RequestLog
 from service.api.route import JSON, OCTETS, Reply, is_json, media_type
 from service.api.server.connections import CONNECTION
+from service.api.shared import Shared
 from service.api.stream.routes import EchoRoute, StreamRoute, Streams
 from service.foundation.errors import BusyError, ServiceError
 from service.foundation.settings import Settings
@@ -33,11 +35,11 @@ _STREAM = re.compile(r"/v1/models/([^/]+)/stream")
 class DataApp:
     """The application of the data plane. What it cannot answer it hands over."""
 
-    def __init__(self, control: ControlLink, meters: Meters) -> None:
+    def __init__(self, control: ControlLink, meters: Meters, shared: Shared) -> None:
         self.state = SimpleNamespace(loaded=control.loaded, learners=control, meters=meters, rules=self)
         self._control = control
         self.exception_handlers: dict[type, Any] = {}
-        streams = Streams()
+        streams = Streams(shared.counters.gauge("admitted streams"))
         self._stream, self._echo = StreamRoute(streams), EchoRoute(streams)
 
     def of(self, method: str, path: str) -> Rule:
@@ -107,13 +109,15 @@ class DataApp:
         return None if answer is None else Reply(encode(answer))
 
 
-def with_middleware(app: DataApp, settings: Settings, keyring: Keyring | None, meters: Meters) -> ASGIApp:
+def with_middleware(
+    app: DataApp, settings: Settings, keyring: Keyring | None, meters: Meters, shared: Shared
+) -> ASGIApp:
     """Return the application below the middleware that queries pass in the control plane too."""
     wrapped: ASGIApp = app
     if settings.max_requests_per_s is not None:
-        wrapped = RateLimit(wrapped, settings.max_requests_per_s, settings.max_request_burst)
+        wrapped = RateLimit(wrapped, settings.max_requests_per_s, settings.max_request_burst, shared.buckets)
     wrapped = LocalAccess(wrapped) if keyring is None else KeyAccess(wrapped, keyring)
-    wrapped = Gate(wrapped, MAX_REQUESTS)
+    wrapped = Gate(wrapped, MAX_REQUESTS, shared.counters.gauge("admitted requests"))
     log = RequestLog(["/v1/echo", "/v1/models/{model}/predict"], settings.log_slow_s, MAX_REFUSALS_PER_S)
     wrapped = RequestContext(wrapped, meters, log)
 

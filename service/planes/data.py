@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from service.api.access.keys import REFRESH_S, Keyring
 from service.api.server import sockets
 from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
+from service.api.shared import SharedMemory
 from service.foundation.settings import Settings
 from service.planes.answers import DataApp, with_middleware
 from service.planes.handover import DataProtocol
@@ -30,27 +31,33 @@ logger = logging.getLogger(__name__)
 BEAT = Struct("<QQ")
 """Process of the data plane, and a number that it counts up."""
 BEAT_S = 0.05
+CONTROL_PART, DATA_PARTS = 0, {1, 2}
+"""Parts of the shared memory: of the control plane, and of the data plane and its spare."""
 
 
-def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any) -> None:
-    """Follow the control plane; answer once no other data plane lives."""
+def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any, memory: SharedMemory, part: int) -> None:
+    """Follow the control plane; answer once no other data plane lives. part: that of this process in `memory`."""
+    shared = memory.join(part)
     sys.setswitchinterval(3e-5)
     threadpool_limits(SERVING_THREADS)
     from lipcore.posterior.threads import limit_threads  # noqa: PLC0415 - the numerics
 
     limit_threads(SERVING_THREADS)
-    keyring = Keyring(REFRESH_S, settings.max_request_burst) if settings.keys_needed else None
-    control, meters = ControlLink(settings, link, keyring), Meters()
+    burst = settings.max_request_burst
+    keyring = Keyring(REFRESH_S, burst, shared.counters, shared.buckets) if settings.keys_needed else None
+    control, meters = ControlLink(settings, link, keyring), Meters(counters=shared.counters)
     control.published.wait()
     held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
     fcntl.flock(held, fcntl.LOCK_EX)  # the kernel frees it the moment the process that held it is gone
     logger.info("process %d is the data plane", os.getpid())
-    app = DataApp(control, meters)
+    for other in DATA_PARTS - {part}:
+        shared.counters.clear_gauges(other)
+    app = DataApp(control, meters, shared)
     made: Any = type("DataConnection", (DataProtocol,), {"send": staticmethod(control.pass_on)})
     limited = guarded(settings)
     made.patience, made.limit = limited.patience, limited.limit
     config = uvicorn.Config(
-        with_middleware(app, settings, keyring, meters),
+        with_middleware(app, settings, keyring, meters, shared),
         log_config=None,
         access_log=False,
         loop="uvloop",

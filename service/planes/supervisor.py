@@ -15,6 +15,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import uvicorn
 
 from service.api.server import sockets
 from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
+from service.api.shared import Shared, SharedMemory
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.models import registry
@@ -54,14 +56,15 @@ def serve(settings: Settings) -> None:
 
         def start_control() -> None:
             listener.close()
-            _control(settings, accepting)
+            _control(settings, accepting, memory.join(data.CONTROL_PART))
 
-        def start_data() -> None:
+        def start_data(part: int) -> None:
             accepting.close()
-            data.run(settings, listener, link, lock, beats)
+            data.run(settings, listener, link, lock, beats, memory, part)
 
+        memory = SharedMemory(1 + len(data.DATA_PARTS), settings, Path(folder) / "calls")
         beats = mmap.mmap(-1, mmap.PAGESIZE)  # shared with all that are forked
-        _supervise({"control": start_control, "data": start_data, "spare": start_data}, beats)
+        _supervise({"control": start_control, "data": partial(start_data, 1), "spare": partial(start_data, 2)}, beats)
 
 
 def _import_all(settings: Settings) -> None:
@@ -145,10 +148,10 @@ def _fork(work: Callable[[], None], name: str) -> int:
     os._exit(0)
 
 
-def _control(settings: Settings, link: socket.socket) -> None:
+def _control(settings: Settings, link: socket.socket, shared: Shared) -> None:
     nursery.start()
     companion.FORK = nursery.fork
-    served = create_app(settings)
+    served = create_app(settings, shared)
     config = uvicorn.Config(
         served,
         log_config=None,
