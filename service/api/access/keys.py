@@ -54,10 +54,6 @@ class KeyRate:
             message = f"Too many requests with API key {key}: at most {self.per_s:g} per s."
             raise RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
 
-    def give_back(self, key: str) -> None:
-        """Return what `count` counted, of a request that another process counts again."""
-        self._rate.give_back((KeyRate, key), monotonic())
-
 
 @dataclass(slots=True, eq=False)
 class Key:

@@ -16,7 +16,6 @@ from service.api.access.keys import CHALLENGE, Key, Keyring, invalid_key
 from service.api.access.scopes import ADMIN, WEBSOCKET, Rules, scopes_of_stream
 from service.api.errors import refuse
 from service.api.limits.rates import COUNTED
-from service.api.requests import HANDED_OVER
 from service.api.server.connections import CONNECTION, StreamProtocol
 from service.foundation.errors import ForbiddenError, NotFoundError, ServiceError, problem, readable
 from service.foundation.settings import is_loopback
@@ -162,8 +161,6 @@ class KeyAccess:
             await self._stream(key, scope, receive, send)
         else:
             await self._events(key, scope, receive, send)
-        if HANDED_OVER in scope and key.rate is not None:
-            key.rate.give_back(key.id)
 
     async def _stream(self, key: Key, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a WebSocket until its key becomes invalid."""

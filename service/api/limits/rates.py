@@ -12,7 +12,6 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.api.errors import refuse
 from service.api.limits.requests import HEALTH, client_of
-from service.api.requests import HANDED_OVER
 from service.foundation.errors import RateLimitedError
 
 MAX_CLIENTS = 16_384
@@ -20,7 +19,7 @@ MAX_CLIENTS = 16_384
 PLACES = 8
 """Number of places that a client's bucket may be at."""
 COUNTED = "lipserve.counted"
-"""Marks the ASGI scope of a request that was already counted: its key has its own rate."""
+"""Marks the ASGI scope of a request that was already counted: by its key's own rate, or by another process."""
 
 
 class Buckets:
@@ -74,11 +73,6 @@ class Rate:
         self._buckets.fill_by(place, then)
         return 0.0
 
-    def give_back(self, client: Hashable, at: float) -> None:
-        """Return a token that was used for a request that another process counts again."""
-        place, full = self._buckets.find(client, at)
-        self._buckets.fill_by(place, full - self.step)
-
 
 class RateLimit:
     """Middleware that limits the request rate of each client. It runs inside the middleware that checks keys.
@@ -102,6 +96,5 @@ class RateLimit:
             error = RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
             await refuse(error, scope, receive, send)
             return
+        scope[COUNTED] = True
         await self.app(scope, receive, send)
-        if HANDED_OVER in scope:
-            self.rate.give_back(client, monotonic())

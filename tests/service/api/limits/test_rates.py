@@ -5,7 +5,6 @@ import os
 import pytest
 
 from service.api.limits.rates import Buckets, Rate, RateLimit
-from service.api.requests import HANDED_OVER
 from tests.service.api.limits.test_requests import STREAM, call, error_of, succeed
 
 pytestmark = pytest.mark.anyio
@@ -56,15 +55,6 @@ def test_processes_share_buckets():
         os.close(descriptor)
 
 
-def test_given_back_token_is_used_again():
-    rate = Rate(per_s=1, burst=2)
-    assert [rate.wait("a", 1.0) for _ in range(3)] == [0, 0, 1]
-    rate.give_back("a", 1.0)
-    assert [rate.wait("a", 1.0) for _ in range(2)] == [0, 1]
-    rate.give_back("b", 1.0)  # which is full
-    assert [rate.wait("b", 1.0) for _ in range(3)] == [0, 0, 1]
-
-
 async def test_requests_beyond_the_rate_get_429():
     limited = RateLimit(succeed, per_s=0.001, burst=2)
     assert [(await call(limited))[0]["status"] for _ in range(2)] == [200, 200]
@@ -75,15 +65,3 @@ async def test_requests_beyond_the_rate_get_429():
     assert isinstance(error_of(await call(limited, "/v2/models/panda-sim/infer"), 429)[1], str)
     assert (await call(limited, STREAM, "websocket"))[0]["status"] == 429
     assert (await call(limited, "/health/live"))[0]["status"] == 200
-
-
-async def test_request_that_another_process_answers_is_counted_there():
-    async def hand_over(scope, *_):
-        scope[HANDED_OVER] = True
-
-    limit = RateLimit(succeed, per_s=0.001, burst=1)
-    limit.app = hand_over
-    for _ in range(3):
-        assert await call(limit) == []
-    limit.app = succeed
-    assert [(await call(limit))[0]["status"] for _ in range(2)] == [200, 429]
