@@ -162,6 +162,10 @@ class Learners:
         """Log frames of a stream, see `frames.observe_frames`. Blocking: use it in a thread."""
         return observe_frames(self._log, frames)
 
+    async def log_frames(self, model: str, make: Callable[[], Frames], arrived: float) -> FramesResult:
+        """Log frames of a stream in a thread, in order of arrival; see `IngestThreads.run`."""
+        return await self.threads.run(model, lambda: self.observe_frames(make()), arrived=arrived)
+
     def monitor(self, model: str) -> Monitor:
         """Return the monitor of a model, up to date with batches that other services have logged.
 

@@ -18,6 +18,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.online.transfer import Revision
 from service.contract.states import PartState
 from service.foundation.errors import NotFoundError, UnreadableVersionError
+from service.foundation.settings import Settings
 from service.models import registry
 from service.models.lineage import learnt_from
 from service.models.loads import StreamPayloads
@@ -96,6 +97,11 @@ class LoadedModels:
         self._unreadable: dict[Key, str] = {}
         self._scales: dict[Key, Scales] = {}
         self._payloads: dict[Key, StreamPayloads] = {}
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the service."""
+        return self.storage.settings
 
     def hot(self, model: str, version: int | None, alias: str | None = None) -> ServedModel | None:
         """Return a version, or the version of an alias, if it is in memory; never waits.

@@ -23,7 +23,7 @@ from service.models.loads import StreamPayload, StreamPayloads
 from service.models.scales import Factor, Scales
 
 if TYPE_CHECKING:
-    from service.models.loaded import LoadedModels
+    from service.foundation.settings import Settings
 
 Key = tuple[str, int]
 """Name of a model and number of a version."""
@@ -168,15 +168,46 @@ class RevisionWaiters:
                     del self._waiters[model]
 
 
+class AnsweringModels(Protocol):
+    """The versions in memory, as queries and streams need them: `LoadedModels`, and its copy in another process."""
+
+    waiters: RevisionWaiters
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the service."""
+        ...
+
+    def hot(self, model: str, version: int | None, alias: str | None = None) -> ServedModel | None:
+        """Return a version if it is in memory; never waits."""
+        ...
+
+    def get(self, model: str, version: int | None, alias: str | None = None) -> ServedModel:
+        """Return a version, after loading it if needed. Blocking; raise ServiceError."""
+        ...
+
+    def newest(self, model: str, alias: str | None = None) -> int | None:
+        """Return the number of the version of an alias, or of the serving version."""
+        ...
+
+    def is_deleted(self, model: str, version: int) -> bool:
+        """Return whether a version was deleted."""
+        ...
+
+    def wake(self, model: str) -> None:
+        """Let the learner look for batches of a model that another service has logged."""
+        ...
+
+
 async def wait_for_revision(
-    loaded: LoadedModels, model: str, version: int | None, alias: str | None, revision: int
+    loaded: AnsweringModels, model: str, version: int | None, alias: str | None, revision: int
 ) -> ServedModel:
     """Wait until a version has reached a revision and return it. Use it in the event loop; it does not block.
 
     Raise RevisionNotReachedError after `min_revision_wait_s`, NotFoundError or UnreadableVersionError at once.
     """
     loop = asyncio.get_running_loop()
-    until, asked = loop.time() + loaded.storage.settings.min_revision_wait_s, False
+    until, asked = loop.time() + loaded.settings.min_revision_wait_s, False
     with loaded.waiters.waiter(model) as waiter:
         while True:
             served = loaded.hot(model, version, alias)

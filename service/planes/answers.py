@@ -105,7 +105,7 @@ class DataApp:
             served = await wait_for_revision(loaded, model, query.version, query.alias, query.min_revision)
         if served is None:
             return None
-        answer = predicting.predict_now(served, motion, loaded.storage.settings.max_position, query.payload)
+        answer = predicting.predict_now(served, motion, loaded.settings.max_position, query.payload)
         return None if answer is None else Reply(encode(answer))
 
 

@@ -33,7 +33,6 @@ class ControlLink:
         self.settings, self.keyring = settings, keyring
         self.loaded = PublishedModels(settings, self._request)
         self.published = threading.Event()
-        self.threads = self  # stands in for `IngestThreads`
         self._path = path
         self._channel: Channel | None = None
         self._numbers, self._logging = itertools.count(), dict[int, asyncio.Future[Any]]()
@@ -52,13 +51,9 @@ class ControlLink:
         """Pass a connection on to the control plane; never waits."""
         return self._send(("connection", PickleBuffer(data)), [fd], wait=False)
 
-    def observe_frames(self, frames: Frames) -> Frames:
-        """Return the frames, which `run` sends."""
-        return frames
-
-    async def run(self, model: str, work: Callable[[], Frames], arrived: float | None = None) -> FramesResult:
+    async def log_frames(self, model: str, make: Callable[[], Frames], arrived: float) -> FramesResult:
         """Let the control plane log frames; return its result once they are durable. Raise ServiceError."""
-        frames, loop = work(), asyncio.get_running_loop()
+        frames, loop = make(), asyncio.get_running_loop()
         served, number = frames.served, next(self._numbers)
         sent: Any = Frames(**{**frames.__dict__, "served": None})
         message = ("frames", number, sent, served.version, served.revision)

@@ -6,7 +6,6 @@ import gc
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -40,7 +39,7 @@ class PublishedModels:
     """
 
     def __init__(self, settings: Settings, request: Callable[[str, int | None, str | None], None]) -> None:
-        self.storage = SimpleNamespace(settings=settings)
+        self.settings = settings
         self.waiters = RevisionWaiters()
         self._files, self._request = Files.of(settings), request
         self._snapshot = Snapshot()
@@ -56,7 +55,7 @@ class PublishedModels:
         snapshot = self._snapshot
         return snapshot.serving.get(model) if alias in (None, SERVING) else snapshot.aliases.get((model, alias))
 
-    def is_deleted(self, model: str, version: int | None) -> bool:
+    def is_deleted(self, model: str, version: int) -> bool:
         """Return whether a version was deleted."""
         return (model, version) in self._snapshot.deleted
 

@@ -144,7 +144,7 @@ class KeyAccess:
             key = self.keyring.find(secret_of(scope))
             scope[KEY_ID] = key.id  # before the checks: the log also names the key of a refused request
             self.keyring.use(key)
-            if key.rate is not None:
+            if key.rate is not None and COUNTED not in scope:
                 key.rate.count(key.id)
                 scope[COUNTED] = True
             if rule is None:

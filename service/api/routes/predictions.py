@@ -28,7 +28,7 @@ from service.inference.gravity import gravity as gravity_torque
 from service.inference.predicting import encode, one_motion, queries
 from service.inference.wrench import wrench as external_wrench
 from service.models.loaded import LoadedModels
-from service.models.served import ServedModel, wait_for_revision
+from service.models.served import AnsweringModels, ServedModel, wait_for_revision
 
 _CONTENT: dict[str, Any] = {
     "application/json": {"schema": {}, "example": {"q": [0.0, -0.5], "dq": [0.1, 0.0], "ddq": [0.0, 0.5]}},
@@ -42,7 +42,8 @@ _DOCUMENTED: dict[str, Any] = {
 echo_hot = APIRouter(tags=["inference"], responses=responses(TooLargeError))
 
 
-async def _echo(scope: Scope, body: bytes) -> Reply | None:
+async def answer_echo(scope: Scope, body: bytes) -> Reply | None:
+    """Return the body; None if it has no media type."""
     if not media_type(scope):
         return None
     return Reply(body, JSON if is_json(scope) else OCTETS)
@@ -55,7 +56,7 @@ async def echo(request: Request) -> Response:
     Use it to measure latency: the echo takes the time of HTTP and of the client. The extra time of a query is the
     computation. JSON is returned as JSON, anything else as `application/octet-stream`.
     """
-    # requests with a media type are answered by `_echo`. Octets: the body must never be shown as a page of the service
+    # requests with a media type are answered by `answer_echo`. Octets: the body must never be shown as a page of the service
     return Reply(await request.body(), OCTETS).response()
 
 
@@ -66,7 +67,7 @@ echo_hot.add_api_route(
     summary="Echo a body",
     response_class=Response,
     openapi_extra=_DOCUMENTED,
-    route_class_override=hot_route(_echo),
+    route_class_override=hot_route(answer_echo),
 )
 
 
@@ -90,15 +91,32 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     state = scope["app"].state
     loaded: LoadedModels = state.loaded
     model: str = scope["path_params"]["model"]
-    served, motion = loaded.hot(model, query.version, query.alias), one_motion(query)
-    if query.min_revision is not None:
+    reply, served = answer_query(loaded, model, query), None
+    if reply is None and query.min_revision is not None:
         served = await wait_for_revision(loaded, model, query.version, query.alias, query.min_revision)
-    if served is not None and motion is not None:
-        at_once = predicting.predict_now(served, motion, loaded.storage.settings.max_position, query.payload)
-        if at_once is not None:
-            return Reply(encode(at_once))
+        reply = answer_query(loaded, model, query)
+    if reply is not None:
+        return reply
     request = queries.request(query)
     return None if request is None else Reply(await _in_thread(loaded, state.turns.predictions, model, request, served))
+
+
+async def answer_at_once(scope: Scope, body: bytes) -> Reply | None:
+    """Answer a query of a control loop without waiting; return None for any other."""
+    query = queries.decode(body) if is_json(scope) else None
+    return None if query is None else answer_query(scope["app"].state.loaded, scope["path_params"]["model"], query)
+
+
+def answer_query(loaded: AnsweringModels, model: str, query: Any) -> Reply | None:
+    """Answer a decoded query of one motion.
+
+    Return None for any other query, and if its version is not in memory or has not reached its revision.
+    """
+    motion, served = one_motion(query), loaded.hot(model, query.version, query.alias)
+    if motion is None or served is None or served.revision < (query.min_revision or 0):
+        return None
+    answer = predicting.predict_now(served, motion, loaded.settings.max_position, query.payload)
+    return None if answer is None else Reply(encode(answer))
 
 
 async def _in_thread(

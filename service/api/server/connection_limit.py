@@ -6,6 +6,7 @@ replaces its own connections.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from typing import Any, Protocol
 
@@ -26,15 +27,29 @@ class LimitedConnection(Protocol):
         ...
 
 
+class OtherConnections(Protocol):
+    """The connections of the same server that another process answers. `peer` None: of all clients."""
+
+    def count(self, peer: str | None) -> int:
+        """Return the number of connections of a client."""
+        ...
+
+    def shed(self, peer: str | None) -> bool:
+        """Let the other process close an idle connection of a client; return False if it has none."""
+        ...
+
+
 class ConnectionLimit:
     """The connections of one server, in the order in which they are closed. Use it in the event loop.
 
     First come connections without any request, then idle ones after an answer, then those of clients that do not read
     their answer; the oldest of each kind first. A connection that is being answered is never closed.
+    `others` are counted and closed too, after those of this process.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, others: OtherConnections | None = None) -> None:
         self.most, self.most_of_one = settings.max_connections, settings.max_connections_per_client
+        self.others = others
         self._trusted: Any = ProxyHeadersMiddleware(_nothing, settings.trusted_proxies).trusted_hosts
         self._fresh: dict[LimitedConnection, None] = {}
         self._rested: dict[LimitedConnection, None] = {}
@@ -52,14 +67,18 @@ class ConnectionLimit:
 
         Return the number of connections above a limit (0 if there is room now) and the reason.
         """
-        self._fresh[connection] = None
+        self.adopt(connection)
         beyond, why = self._beyond_own(connection, present)
-        if beyond <= 0 or self._shed(connection, connection.peer):
-            beyond = len(present) - len(self._leaving) - self.most
+        if beyond <= 0 or self._make_room(connection, connection.peer):
+            beyond = len(present) + self._count_others(None) - len(self._leaving) - self.most
             why = f"Too many connections: at most {self.most} (LIPSERVE_MAX_CONNECTIONS)."
-            if beyond <= 0 or self._shed(connection, None):
+            if beyond <= 0 or self._make_room(connection, None):
                 return 0, ""
         return beyond, why
+
+    def adopt(self, connection: LimitedConnection) -> None:
+        """Add a connection that another process has admitted."""
+        self._fresh[connection] = None
 
     def mark_busy(self, connection: LimitedConnection) -> None:
         """Mark a connection that has a request or is no longer an HTTP connection."""
@@ -81,9 +100,10 @@ class ConnectionLimit:
         self._leaving.discard(connection)
 
     def _beyond_own(self, connection: LimitedConnection, present: Collection[Any]) -> tuple[int, str]:
-        if connection.peer is None or len(present) <= self.most_of_one:
+        if connection.peer is None or len(present) + self._count_others(None) <= self.most_of_one:
             return 0, ""
         own = sum(self._peer_of(each) == connection.peer for each in present if each not in self._leaving)
+        own += self._count_others(connection.peer)
         limit = f"at most {self.most_of_one} (LIPSERVE_MAX_CONNECTIONS_PER_CLIENT)"
         return own - self.most_of_one, f"Too many connections from {connection.peer}: {limit}."
 
@@ -93,7 +113,17 @@ class ConnectionLimit:
             return peer
         return self.find_peer(connection.client)  # a stream
 
-    def _shed(self, coming: LimitedConnection, peer: str | None) -> bool:
+    def count_by_peer(self, present: Collection[Any]) -> Counter[str | None]:
+        """Return the number of connections of each client; None: of those that do not identify their client."""
+        return Counter(self._peer_of(each) for each in present if each not in self._leaving)
+
+    def _count_others(self, peer: str | None) -> int:
+        return 0 if self.others is None else self.others.count(peer)
+
+    def _make_room(self, coming: LimitedConnection, peer: str | None) -> bool:
+        return self.shed(peer, coming) or (self.others is not None and self.others.shed(peer))
+
+    def shed(self, peer: str | None, coming: LimitedConnection | None = None) -> bool:
         """Close the first idle connection except the new one, of one client if given; return whether there was one."""
         for connection in self._idle():
             if connection is not coming and peer in (None, connection.peer):

@@ -10,7 +10,7 @@ import termios
 from contextlib import suppress
 from http import HTTPStatus
 from time import perf_counter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn import _types as asgi
@@ -45,20 +45,28 @@ class GuardedProtocol(HttpToolsProtocol):
         self._upgraded = False  # to a stream, which then reads the socket
         self._known: object = None
         self.peer: str | None = None
+        self.refused = ""  # why requests are answered with 429, if they are
         self._overhead = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Accept the connection, or refuse it if there are too many and none is idle."""
         super().connection_made(transport)
         self.peer = self.limit.find_peer(self.client)
-        beyond, why = self.limit.admit(self, self.connections)
+        beyond, why = self.admit()
         if beyond > MAX_REFUSED_CONNECTIONS:
             transport.abort()
             return
         if beyond > 0:
-            self.app = _Refusing(self.app, why)
-            self.ws_protocol_class = None
-        self._head = self.loop.call_later(self.patience.header_s, self._late)
+            self.refuse_requests(why)
+        self._watch_head()
+
+    def admit(self) -> tuple[int, str]:
+        """Make room for this connection; see `ConnectionLimit.admit`."""
+        return self.limit.admit(self, self.connections)
+
+    def refuse_requests(self, why: str) -> None:
+        """Answer all requests but health with 429."""
+        self.refused, self.app, self.ws_protocol_class = why, _Refusing(self.app, why), None
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the connection and its timers."""
@@ -78,8 +86,7 @@ class GuardedProtocol(HttpToolsProtocol):
         cycle = self.cycle
         if cycle is None or cycle.response_complete:
             # part of a request line and headers, or the rest of a rejected body
-            if self._head is None and not self.transport.is_closing():
-                self._head = self.loop.call_later(self.patience.header_s, self._late)
+            self._watch_head()
         else:
             if self._head is not None:
                 self._cancel_head()
@@ -137,6 +144,10 @@ class GuardedProtocol(HttpToolsProtocol):
 
     def _unsupported_upgrade_warning(self) -> None:
         """Log nothing: clients could fill the log."""
+
+    def _watch_head(self) -> None:
+        if self._head is None and not self.transport.is_closing():
+            self._head = self.loop.call_later(self.patience.header_s, self._late)
 
     def _cancel_head(self) -> None:
         if self._head is not None:
@@ -209,9 +220,20 @@ class _Refusing:
         await refuse(BusyError(f"{self.why} Try again later.", headers=headers), scope, receive, send)
 
 
-def guarded(settings: Settings, patience: ClientPatience = PATIENCE) -> type[GuardedProtocol]:
-    """Return a connection class with the limits of the settings, for `uvicorn.Config(http=...)`."""
-    return type("GuardedProtocol", (GuardedProtocol,), {"patience": patience, "limit": ConnectionLimit(settings)})
+Guarded = TypeVar("Guarded", bound=GuardedProtocol)
+
+
+def guarded(
+    settings: Settings,
+    patience: ClientPatience = PATIENCE,
+    kind: type[Guarded] = GuardedProtocol,  # type: ignore[assignment]
+    **fields: Any,
+) -> type[Guarded]:
+    """Return a connection class with the limits of the settings, for `uvicorn.Config(http=...)`.
+
+    kind: its base class; fields: further class variables.
+    """
+    return type(kind.__name__, (kind,), {"patience": patience, "limit": ConnectionLimit(settings), **fields})
 
 
 CONNECTION = "lipserve.connection"

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,9 +19,9 @@ from service.api.errors import UNEXPECTED_ERROR
 from service.contract.frames import NUMBER, REQUEST
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
 from service.learning.ingest.clock import MIN_STEP_S
-from service.learning.ingest.frames import Frames
-from service.learning.learners import Learners
-from service.models.loaded import ServedModel
+from service.foundation.settings import Settings
+from service.learning.ingest.frames import Frames, FramesResult
+from service.models.served import AnsweringModels, ServedModel
 from service.storage.errors import translate_error
 
 logger = logging.getLogger(__name__)
@@ -45,13 +45,34 @@ class LearningFrame(NamedTuple):
     """Factor on the half width of the interval, (n,)."""
 
 
+class StreamLearners(Protocol):
+    """The learners of the service as streams need them: `Learners`, or its end in another process."""
+
+    @property
+    def settings(self) -> Settings:
+        """The settings of the service."""
+        ...
+
+    @property
+    def loaded(self) -> AnsweringModels:
+        """The versions in memory."""
+        ...
+
+    async def log_frames(self, model: str, make: Callable[[], Frames], arrived: float) -> FramesResult:
+        """Log the frames that `make` returns; return once they are durable.
+
+        arrived: time at which the first frame arrived, by `time.perf_counter`. Raise ServiceError.
+        """
+        ...
+
+
 class FrameLearning:
     """Logs the frames of one connection in blocks, one at a time and in order, while later frames wait.
 
     `send` sends a text to the client. Use it in the event loop; blocks are logged in a thread.
     """
 
-    def __init__(self, learners: Learners, stream_id: str, send: Callable[[str], Awaitable[None]]) -> None:
+    def __init__(self, learners: StreamLearners, stream_id: str, send: Callable[[str], Awaitable[None]]) -> None:
         self._learners, self._stream_id, self._send = learners, stream_id, send
         self._block_rows, self._max_wait_s = learners.settings.stream_flush_rows, learners.settings.stream_flush_s
         self._clock = time.time() - perf_counter()
@@ -132,19 +153,11 @@ class FrameLearning:
         """Log a block; return the message for the client."""
         first, through = block[0].sequence, block[-1].sequence
         try:
-            result = await self._learners.threads.run(
-                block[0].served.name,
-                lambda: self._learners.observe_frames(self._frames(block)),
-                arrived=block[0].arrived,
+            result = await self._learners.log_frames(
+                block[0].served.name, lambda: self._frames(block), block[0].arrived
             )
-        except ServiceError as error:
-            refusal = error
         except Exception as error:  # later blocks may succeed
-            known = translate_error(error)
-            logger.error(
-                "frames of stream %r could not be learnt: %s", self._stream_id, error, exc_info=None if known else error
-            )
-            refusal = known or ServiceError(UNEXPECTED_ERROR)
+            refusal = refusal_of(error, self._stream_id)
         else:
             return {"learnt": asdict(result)}
         if self._ended:
@@ -170,6 +183,15 @@ class FrameLearning:
         times: Array = np.maximum.accumulate(np.maximum(arrived - ticks, self._time)) + ticks
         self._time = float(times[-1])
         return times
+
+
+def refusal_of(error: Exception, stream_id: str) -> ServiceError:
+    """Return the error for a client whose frames could not be logged; log one that is not the client's."""
+    if isinstance(error, ServiceError):
+        return error
+    known = translate_error(error)
+    logger.error("frames of stream %r could not be learnt: %s", stream_id, error, exc_info=None if known else error)
+    return known or ServiceError(UNEXPECTED_ERROR)
 
 
 def _columns(rows: list[bytes], count: int) -> Array:

@@ -14,11 +14,11 @@ from uvicorn.protocols.utils import ClientDisconnected
 from service.api.access.scopes import ADMIN, PREDICT, Rule
 from service.api.server.connections import CONNECTION, StreamProtocol
 from service.api.stream.conversation import Conversation, Echo
+from service.api.stream.learning import StreamLearners
 from service.api.stream.session import Session
 from service.contract.models import ALIAS
 from service.contract.predictions import one_choice
 from service.foundation.errors import NotFoundError, NotReadyError, invalid_request, readable
-from service.learning.learners import Learners
 from service.models.served import wait_for_revision
 from service.runtime.counted import OpenCounter
 from service.telemetry.counters import Gauge
@@ -69,13 +69,13 @@ class EchoRoute:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one client. An error raised before the connection is accepted is answered in HTTP."""
-        learners: Learners = scope["app"].state.learners
+        learners: StreamLearners = scope["app"].state.learners
         with self.streams.count_one(learners.settings.max_streams):
             conversation = await self.conversation(learners, scope, receive, send)
             with suppress(ClientDisconnected):  # the client disconnected during an answer, or its key became invalid
                 await conversation.run()
 
-    async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
+    async def conversation(self, learners: StreamLearners, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return the conversation with the client; raise ServiceError for a wrong address."""
         return Echo(_connection(scope), receive, send, learners.settings)
 
@@ -85,7 +85,7 @@ class StreamRoute(EchoRoute):
 
     path = PATH
 
-    async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
+    async def conversation(self, learners: StreamLearners, scope: Scope, receive: Receive, send: Send) -> Conversation:
         """Return the conversation with the client.
 
         Raise InvalidRequestError, NotFoundError, UnreadableVersionError or RevisionNotReachedError.

@@ -20,15 +20,14 @@ from lipcore.vocabulary import offered_components
 from service.api.errors import UNEXPECTED_ERROR
 from service.api.server.connections import StreamProtocol
 from service.api.stream.conversation import Conversation
-from service.api.stream.learning import FrameLearning, LearningFrame
+from service.api.stream.learning import FrameLearning, LearningFrame, StreamLearners
 from service.api.stream.parts import answer_part
 from service.api.stream.reading import FrameReader
 from service.contract import frames
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.inference.predicting import check_answer
-from service.learning.learners import Learners
-from service.models.loaded import ServedModel
 from service.models.registry import SERVING
+from service.models.served import ServedModel
 from service.telemetry.meters import StreamMeter
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ class Session(Conversation):
         connection: StreamProtocol,
         receive: Receive,
         send: Send,
-        learners: Learners,
+        learners: StreamLearners,
         served: ServedModel,
         meter: StreamMeter,
         pinned: bool,
