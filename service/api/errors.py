@@ -61,7 +61,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(ClientDisconnect, _cut_off)
     for kind in (DBAPIError, PoolTimeoutError, OSError):
         app.add_exception_handler(kind, _storage_error)
-    app.add_exception_handler(Exception, _unexpected_error)
+    app.add_exception_handler(Exception, unexpected_error)
 
 
 def answer_of(scope: Scope, error: ServiceError) -> JSONResponse:
@@ -159,7 +159,8 @@ async def _storage_error(request: Request, error: Exception) -> JSONResponse:
     return answer_of(request.scope, answer)
 
 
-async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
+async def unexpected_error(request: Request, error: Exception) -> JSONResponse:
+    """Answer an unexpected exception, and log it with its traceback."""
     if request.scope.get(ERROR_CODE) != "internal_error":  # else already answered: the exception is raised again
         logger.error("unexpected error at %s %s", request.method, request.url.path, exc_info=error)
     return _answer(request.scope, 500, "internal_error", UNEXPECTED_ERROR)

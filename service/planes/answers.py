@@ -2,111 +2,131 @@
 
 from __future__ import annotations
 
-import re
-from types import SimpleNamespace
-from typing import Any
+import logging
+from collections.abc import Mapping
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
+from starlette.datastructures import State
+from starlette.routing import compile_path
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.api.access.keys import Keyring
 from service.api.access.middleware import KeyAccess, LocalAccess
-from service.api.access.scopes import PREDICT, Rule
-from service.api.errors import refuse
+from service.api.access.scopes import Rules
+from service.api.errors import refuse, unexpected_error
 from service.api.limits.rates import RateLimit
 from service.api.limits.requests import MAX_REQUESTS, Gate
-from service.api.requests import HANDED_OVER, MAX_REFUSALS_PER_S, RequestContext, RequestLog
-from service.api.route import JSON, OCTETS, Reply, is_json, media_type
-from service.api.server.connections import CONNECTION
+from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
+from service.api.route import Answerer
+from service.api.oip import routes as oip
+from service.api.oip.statistics import Statistics
+from service.api.routes import health, predictions
+from service.api.server.connections import CONNECTION as STREAM
 from service.api.shared import Shared
-from service.api.stream.routes import EchoRoute, StreamRoute, Streams
-from service.foundation.errors import BusyError, ServiceError
+from service.api.stream import routes as stream
+from service.foundation.errors import NotFoundError, NotReadyError, ServiceError
 from service.foundation.settings import Settings
-from service.inference import predicting
-from service.inference.predicting import encode, one_motion, queries
-from service.models.served import wait_for_revision
-from service.planes.handover import PROTOCOL, RAW, pass_on, refuse_connection
-from service.planes.link import ControlLink
+from service.planes.connections import CONNECTION, DataProtocol, DataStream
+from service.planes.frames import RemoteLearners
 from service.telemetry.meters import Meters
 
-_PREDICT = re.compile(r"/v1/models/([^/]+)/predict")
-_STREAM = re.compile(r"/v1/models/([^/]+)/stream")
+logger = logging.getLogger(__name__)
+
+
+class QueryRoute(NamedTuple):
+    """A route of queries. path: as in the control plane, for metrics and logs."""
+
+    path: str
+    answer: Answerer
+
+
+ROUTES = (
+    QueryRoute("/v1/models/{model}/predict", predictions.answer_at_once),
+    QueryRoute("/v1/echo", predictions.answer_echo),
+    QueryRoute("/v2/models/{model}/infer", oip.answer_at_once),
+    QueryRoute("/v2/models/{model}/versions/{version}/infer", oip.answer_at_once),
+    QueryRoute("/health/live", health.answer_live),
+)
+
+
+Found = TypeVar("Found")
+
+
+class Paths(Generic[Found]):
+    """Finds what belongs to a path. given: by path, with parameters in braces."""
+
+    def __init__(self, given: Mapping[str, Found]) -> None:
+        self._patterns = [(compile_path(path)[0], each) for path, each in given.items()]
+
+    def find(self, scope: Scope) -> Found | None:
+        """Return what belongs to the path of a request, and set `path_params`."""
+        for pattern, each in self._patterns:
+            if match := pattern.match(scope["path"]):
+                scope["path_params"] = match.groupdict()
+                return each
+        return None
 
 
 class DataApp:
-    """The application of the data plane. What it cannot answer it hands over."""
+    """The application of the data plane. It hands over what it cannot answer, errors included.
 
-    def __init__(self, control: ControlLink, meters: Meters, shared: Shared) -> None:
-        self.state = SimpleNamespace(loaded=control.loaded, learners=control, meters=meters, rules=self)
-        self._control = control
-        self.exception_handlers: dict[type, Any] = {}
-        streams = Streams(shared.counters.gauge("admitted streams"))
-        self._stream, self._echo = StreamRoute(streams), EchoRoute(streams)
+    state: what routes and middleware read, as in the state of the control plane's application.
+    """
 
-    def of(self, method: str, path: str) -> Rule:
-        """Return the rule of a request: stands in for `Rules`."""
-        return Rule(None if path == "/health/live" else PREDICT, lasting=method == "WEBSOCKET")
+    exception_handlers: ClassVar[dict[type[Exception], Any]] = {Exception: unexpected_error}
+
+    def __init__(self, learners: RemoteLearners, meters: Meters, shared: Shared) -> None:
+        admitted = shared.counters.gauge("admitted streams")
+        declared = [predictions.hot, predictions.echo_hot, oip.hot, health.router, stream.router(admitted)]
+        rules = Rules([route for each in declared for route in each.routes])
+        self.state = State({"loaded": learners.loaded, "learners": learners, "meters": meters, "rules": rules})
+        self.state.sequences, self.state.statistics = shared.sequences, Statistics(shared.counters)
+        counter = stream.Streams(admitted)
+        self._queries = Paths({route.path: route for route in ROUTES})
+        self._streams = Paths({stream.PATH: stream.StreamRoute(counter), stream.ECHO_PATH: stream.EchoRoute(counter)})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request or hand it over."""
-        path: str = scope["path"]
         if scope["type"] == "websocket":
-            match = _STREAM.fullmatch(path)
-            scope["path_params"] = {} if match is None else {"model": match[1]}
-            route = scope["endpoint"] = self._echo if match is None else self._stream
-            try:
-                await route(scope, receive, send)
-            except BusyError as error:
-                await refuse(error, scope, receive, send)
-            except ServiceError:
-                self._hand_over_stream(scope)
-            return
-        if path == "/health/live":  # answered here, so that a hanging control plane does not restart a pod
-            scope["path_params"], scope["route"] = {}, SimpleNamespace(path=path)
-            alive = Reply(b'{"status":"alive"}')
-            await send({"type": "http.response.start", "status": 200, "headers": alive.headers()})
-            await send({"type": "http.response.body", "body": alive.body})
-            return
-        match = _PREDICT.fullmatch(path)
-        scope["path_params"] = {} if match is None else {"model": match[1]}
-        scope["route"] = SimpleNamespace(path="/v1/echo" if match is None else "/v1/models/{model}/predict")
-        body = (await receive())["body"]
+            await self._stream(scope, receive, send)
+        elif not await self._answer(scope, receive, send):
+            connection: DataProtocol = scope[CONNECTION]
+            connection.hand_over()
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> bool:
+        """Answer a query; return whether it was one."""
+        route = self._queries.find(scope)
+        if route is None:
+            return False
+        scope["route"] = route
+        body = (await receive()).get("body", b"")  # whole: see `find_query`
         try:
-            reply = self._echoed(scope, body) if match is None else await self._predicted(scope, body, match[1])
+            reply = None if scope["query_string"] else await route.answer(scope, body)
         except ServiceError:
-            reply = None
+            return False
+        except Exception as error:
+            logger.error("the data plane hands over a query of %s", route.path, exc_info=error)
+            return False
         if reply is None:
-            scope[HANDED_OVER] = True
-            scope[PROTOCOL].hand_over()
-            return
+            return False
         await send({"type": "http.response.start", "status": 200, "headers": reply.headers()})
         await send({"type": "http.response.body", "body": reply.body})
+        return True
 
-    def _hand_over_stream(self, scope: Scope) -> None:
-        """Let the control plane explain why there is no stream."""
-        connection = scope["state"][CONNECTION]
-        scope[HANDED_OVER] = connection.handshake_complete = True  # uvicorn shall not answer
-        if not pass_on(connection.transport, scope["state"][RAW], self._control.pass_on):
-            refuse_connection(connection.transport)
-
-    @staticmethod
-    def _echoed(scope: Scope, body: bytes) -> Reply | None:
-        if not media_type(scope):
-            return None
-        return Reply(body, JSON if is_json(scope) else OCTETS)
-
-    async def _predicted(self, scope: Scope, body: bytes, model: str) -> Reply | None:
-        query = queries.decode(body) if is_json(scope) and not scope["query_string"] else None
-        motion = None if query is None else one_motion(query)
-        if query is None or motion is None:
-            return None
-        loaded: Any = self.state.loaded
-        served = loaded.hot(model, query.version, query.alias)
-        if query.min_revision is not None:
-            served = await wait_for_revision(loaded, model, query.version, query.alias, query.min_revision)
-        if served is None:
-            return None
-        answer = predicting.predict_now(served, motion, loaded.settings.max_position, query.payload)
-        return None if answer is None else Reply(encode(answer))
+    async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve a stream; let the control plane explain that there is no such model."""
+        connection: DataStream = scope["state"][STREAM]
+        route = self._streams.find(scope)
+        if route is None:
+            connection.hand_over()
+            return
+        scope["endpoint"] = route
+        try:
+            await route(scope, receive, send)
+        except (NotFoundError, NotReadyError):
+            connection.hand_over()
+        except ServiceError as error:
+            await refuse(error, scope, receive, send)
 
 
 def with_middleware(
@@ -118,11 +138,11 @@ def with_middleware(
         wrapped = RateLimit(wrapped, settings.max_requests_per_s, settings.max_request_burst, shared.buckets)
     wrapped = LocalAccess(wrapped) if keyring is None else KeyAccess(wrapped, keyring)
     wrapped = Gate(wrapped, MAX_REQUESTS, shared.counters.gauge("admitted requests"))
-    log = RequestLog(["/v1/echo", "/v1/models/{model}/predict"], settings.log_slow_s, MAX_REFUSALS_PER_S)
+    log = RequestLog([route.path for route in ROUTES], settings.log_slow_s, MAX_REFUSALS_PER_S)
     wrapped = RequestContext(wrapped, meters, log)
 
     async def outermost(scope: Scope, receive: Receive, send: Send) -> None:
-        scope["app"] = app
+        scope["app"] = app  # middleware reads its state
         await wrapped(scope, receive, send)
 
     return outermost

@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from struct import Struct
 from typing import Any
@@ -17,11 +18,11 @@ from threadpoolctl import threadpool_limits
 
 from service.api.access.keys import REFRESH_S, Keyring
 from service.api.server import sockets
-from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
+from service.api.server.connections import MAX_FRAME_BYTES, guarded
 from service.api.shared import SharedMemory
 from service.foundation.settings import Settings
 from service.planes.answers import DataApp, with_middleware
-from service.planes.handover import DataProtocol
+from service.planes.connections import DataProtocol, DataStream
 from service.planes.link import ControlLink
 from service.runtime.process import SERVING_THREADS
 from service.telemetry.meters import Meters
@@ -52,17 +53,15 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any, m
     logger.info("process %d is the data plane", os.getpid())
     for other in DATA_PARTS - {part}:
         shared.counters.clear_gauges(other)
-    app = DataApp(control, meters, shared)
-    made: Any = type("DataConnection", (DataProtocol,), {"send": staticmethod(control.pass_on)})
-    limited = guarded(settings)
-    made.patience, made.limit = limited.patience, limited.limit
+    app = DataApp(control.learners, meters, shared)
+    made: Any = guarded(settings, kind=DataProtocol, others=control.passed, control=control.pass_on)
     config = uvicorn.Config(
         with_middleware(app, settings, keyring, meters, shared),
         log_config=None,
         access_log=False,
         loop="uvloop",
         http=made,
-        ws=StreamProtocol,
+        ws=type("DataStream", (DataStream,), {"control": control.pass_on}),
         ws_max_size=MAX_FRAME_BYTES,
         ws_per_message_deflate=False,
         timeout_keep_alive=settings.keep_alive_s,
@@ -73,7 +72,7 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any, m
     server = _Server(config, None, StopState(), settings.stop_notice_s)
 
     def begin() -> None:
-        control.start(lambda first: _adopted(server, made, first))
+        control.start(partial(made, config=config, server_state=server.server_state, app_state=server.lifespan.state))
         beat(1)
 
     def beat(number: int) -> None:
@@ -82,12 +81,6 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any, m
 
     server.begun = begin
     server.run([listener])
-
-
-def _adopted(server: _Server, base: Any, first: bytes) -> Callable[[], asyncio.Protocol]:
-    kind: Any = type("AdoptedConnection", (base,), {"first": first})
-    kind.limit = base.limit
-    return lambda: kind(config=server.config, server_state=server.server_state, app_state=server.lifespan.state)
 
 
 class _Server(sockets.Server):

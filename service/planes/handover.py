@@ -13,47 +13,95 @@ import os
 import re
 import socket
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass
+from pickle import PickleBuffer
+from typing import Protocol
 
-from service.api.server.connections import GuardedProtocol
 from service.foundation.errors import ErrorBody, ErrorResponse
+from service.planes.channel import MIN_SHARED_BYTES
 
 MAX_QUERY_BYTES = 16 * 1024
 """Max size of a request that the data plane answers, with its headers."""
-_QUERY = re.compile(
-    rb"(?:POST /v1/(?:models/[^/ ?]+/predict|echo)|GET /health/live|"
-    rb"GET /v1/(?:models/[^/ ?]+|echo)/stream(?:\?[^ ]*)?) HTTP/1\.1\r\n"
+PART, OTHER = 0, -1
+"""Results of `find_query`: the rest of the query is missing; there is no query."""
+_STARTS = (
+    *(b"POST /v1/models/", b"POST /v1/echo ", b"POST /v2/models/"),
+    *(b"GET /v1/models/", b"GET /v1/echo/stream", b"GET /health/live "),
 )
-_LENGTH = re.compile(rb"\r\ncontent-length:[ \t]*(\d+)[ \t]*\r\n", re.IGNORECASE)
-_ELSE = re.compile(rb"\r\n(?:transfer-encoding|expect|content-encoding):", re.IGNORECASE)
-PROTOCOL, RAW = "lipserve.protocol", "lipserve.raw"
-"""Keys of a scope: the connection of a request; in its state, the bytes of the request of a stream."""
-
-PassOn = Callable[[int, bytes], bool]
-"""Passes a connection on: its file descriptor, which stays open here, and the bytes read. Returns whether it did."""
-
-
-def judge(data: bytes) -> Literal["whole", "part", "other"]:
-    """Return whether the bytes at the start of a request are one whole query, the start of one, or anything else."""
-    end = data.find(b"\r\n\r\n")
-    if len(data) > MAX_QUERY_BYTES:
-        return "other"
-    if end < 0:
-        return "part" if data.startswith((b"POST /v1/", b"GET /v1/models/", b"GET /v1/echo/")) else "other"
-    head = data[: end + 4]
-    if not _QUERY.match(head) or _ELSE.search(head):
-        return "other"
-    length = _LENGTH.search(head)
-    left = end + 4 + (0 if length is None else int(length[1])) - len(data)
-    return "whole" if left == 0 else "part" if left > 0 else "other"
+_QUERY = re.compile(
+    rb"(?:POST /v1/(?:models/[^/ ?]+/predict|echo)|POST /v2/models/[^/ ?]+(?:/versions/[^/ ?]+)?/infer|"
+    rb"GET /health/live) HTTP/1\.1\r\n"
+)
+_STREAM = re.compile(rb"GET /v1/(?:models/[^/ ?]+|echo)/stream(?:\?[^ ]*)? HTTP/1\.1\r\n")
+_HEADERS = re.compile(rb"(?:[!-9;-~]+:[^\x00-\x08\x0a-\x1f\x7f]*\r\n)*\r\n")
+_LENGTH = re.compile(rb"\r\ncontent-length:[ \t]*(\d{1,9})[ \t]*\r\n", re.IGNORECASE)
+_BODY = re.compile(rb"\r\n(?:transfer-encoding|content-length|content-encoding|expect):", re.IGNORECASE)
+_ELSE = re.compile(rb"\r\n(?:transfer-encoding|content-encoding|expect|upgrade):", re.IGNORECASE)
 
 
-def pass_on(transport: asyncio.Transport, data: bytes, send: PassOn) -> bool:
-    """Pass a connection on and end it here; return False if the other plane does not take it."""
+def find_query(data: bytes) -> int:
+    """Return the size of the whole query at the start of the data, else `PART` or `OTHER`.
+
+    Only plain requests are queries: each header a line of its own, the body of a known length.
+    """
+    end = data.find(b"\r\n\r\n") + 4
+    if end < 4:
+        can_be = len(data) <= MAX_QUERY_BYTES and (data.startswith(_STARTS) or _starts_one(data))
+        return PART if can_be and data.count(b"\n") == data.count(b"\r\n") else OTHER
+    line = _QUERY.match(data, 0, end) or _STREAM.match(data, 0, end)
+    if line is None or not _HEADERS.fullmatch(data, line.end(), end):
+        return OTHER
+    if line.re is _STREAM:
+        return OTHER if _BODY.search(data, 0, end) else len(data)
+    lengths = _LENGTH.findall(data, 0, end)
+    if len(lengths) > 1 or _ELSE.search(data, 0, end):
+        return OTHER
+    size = end + int(lengths[0]) if lengths else end
+    if size > MAX_QUERY_BYTES:
+        return OTHER
+    return size if size <= len(data) else PART
+
+
+def _starts_one(data: bytes) -> bool:
+    return any(start.startswith(data) for start in _STARTS)
+
+
+@dataclass(frozen=True)
+class Handed:
+    """A connection that one plane passes to the other, besides its file descriptor."""
+
+    data: bytes | PickleBuffer
+    """The bytes that were read and not answered."""
+    counted: bool = False
+    """Whether rate limits have counted the first request of these bytes."""
+    refused: str = ""
+    """Why all its requests are answered with 429, empty if they are not."""
+    number: int = 0
+    """Counts the connections that the data plane has passed on."""
+
+    @property
+    def read(self) -> bytes:
+        """The bytes that were read and not answered."""
+        return bytes(self.data)
+
+
+class PassOn(Protocol):
+    """Passes a connection to the other plane."""
+
+    def __call__(self, transport: asyncio.Transport, handed: Handed, peer: str | None) -> bool:
+        """Pass the connection of a client on and end it here; return False if the other plane does not take it.
+
+        All bytes written must have left the transport. It never waits. peer: as in `LimitedConnection`.
+        """
+        ...
+
+
+def pass_on(transport: asyncio.Transport, handed: Handed, send: Callable[[int, Handed], bool]) -> bool:
+    """Pass a connection on, as in `PassOn`. send: sends a message with a file descriptor, which stays open here."""
     transport.pause_reading()
     copy = os.dup(transport.get_extra_info("socket").fileno())
     try:
-        sent = send(copy, data)
+        sent = send(copy, handed)
     finally:
         os.close(copy)
     if sent:
@@ -61,93 +109,13 @@ def pass_on(transport: asyncio.Transport, data: bytes, send: PassOn) -> bool:
     return sent
 
 
-class DataProtocol(GuardedProtocol):
-    """A connection in the data plane."""
-
-    send: ClassVar[PassOn]
-    first: bytes = b""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.raw = b""
-        self._part = self._later = b""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin, with the bytes that the control plane has read, if any."""
-        super().connection_made(transport)
-        if self.first:
-            self.data_received(self.first)
-
-    def data_received(self, data: bytes) -> None:
-        """Handle bytes: collect a whole query, or pass the connection on."""
-        if self.cycle is not None and not self.cycle.response_complete:
-            self._later += data  # the next request came before the answer
-            self.transport.pause_reading()
-            return
-        data = self._part + data
-        kind = judge(data)
-        if kind == "part":
-            self._part = data
-            if self._head is None:
-                self._head = self.loop.call_later(self.patience.header_s, self._late)
-            return
-        self._part, self.raw = b"", data
-        if kind == "other":
-            self.hand_over()
-        else:
-            super().data_received(data)
-
-    def handle_websocket_upgrade(self) -> None:
-        """Begin a stream, whose request may still be handed over."""
-        self.app_state = {**self.app_state, RAW: self.raw}
-        super().handle_websocket_upgrade()
-
-    def on_message_begin(self) -> None:
-        """Give the application a way to hand the request over."""
-        super().on_message_begin()
-        scope: Any = self.scope
-        scope[PROTOCOL] = self
-
-    def on_response_complete(self) -> None:
-        """Handle a request that came before the answer."""
-        super().on_response_complete()
-        if self._later and not self.transport.is_closing():
-            later, self._later = self._later, b""
-            self.transport.resume_reading()
-            self.loop.call_soon(self.data_received, later)
-
-    def hand_over(self) -> None:
-        """Let the control plane answer this request and those that follow."""
-        if self.cycle is not None:
-            self.cycle.disconnected = True
-        if not pass_on(self.transport, self.raw + self._later, type(self).send):
-            refuse_connection(self.transport)
-
-    def _late(self) -> None:
-        self._part = b""
-        super()._late()
-
-
-class ControlProtocol(GuardedProtocol):
-    """A connection in the control plane, which came from the data plane."""
-
-    send: ClassVar[PassOn]
-    first: bytes = b""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin with the bytes that the data plane has read."""
-        super().connection_made(transport)
-        super().data_received(self.first)
-
-    def data_received(self, data: bytes) -> None:
-        """Handle bytes; pass the connection back at the start of a query."""
-        idle = self.cycle is not None and self.cycle.response_complete and not self._upgraded and self._head is None
-        if not (idle and judge(data) != "other" and pass_on(self.transport, data, type(self).send)):
-            super().data_received(data)
+def shared(data: bytes) -> bytes | PickleBuffer:
+    """Return bytes in the form in which a message carries them: many of them in shared memory."""
+    return data if len(data) < MIN_SHARED_BYTES else PickleBuffer(data)
 
 
 def refuse_connection(transport: asyncio.Transport) -> None:
-    """Answer that the control plane is gone."""
+    """Answer that the control plane does not answer."""
     error = ErrorBody(code="not_ready", message="The control plane of the service does not answer. Try again later.")
     content = json.dumps(ErrorResponse(error=error).model_dump()).encode()
     head = b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\n"

@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.api.access.keys import CHALLENGE, Key, Keyring, invalid_key
 from service.api.access.scopes import ADMIN, WEBSOCKET, Rules, scopes_of_stream
 from service.api.errors import refuse
-from service.api.limits.rates import COUNTED
+from service.api.limits.requests import COUNTED
 from service.api.server.connections import CONNECTION, StreamProtocol
 from service.foundation.errors import ForbiddenError, NotFoundError, ServiceError, problem, readable
 from service.foundation.settings import is_loopback

@@ -11,15 +11,13 @@ from time import monotonic
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.api.errors import refuse
-from service.api.limits.requests import HEALTH, client_of
+from service.api.limits.requests import COUNTED, HEALTH, client_of
 from service.foundation.errors import RateLimitedError
 
 MAX_CLIENTS = 16_384
 """Max clients with a bucket of their own; the others share one."""
 PLACES = 8
 """Number of places that a client's bucket may be at."""
-COUNTED = "lipserve.counted"
-"""Marks the ASGI scope of a request that was already counted: by its key's own rate, or by another process."""
 
 
 class Buckets:

@@ -246,6 +246,8 @@ async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any)
     return await asyncio.shield(computing)
 
 
+COUNTED = "lipserve.counted"
+"""Marks the ASGI scope of a request that was already counted: by its key's own rate, or by another process."""
 NETWORK_BITS = 64
 """Leading bits of an IPv6 address that identify a client: a client can use all addresses with this prefix."""
 LOCAL = "a local socket"

@@ -7,13 +7,14 @@ from functools import cache
 from typing import Annotated
 
 from fastapi import APIRouter, Depends
+from starlette.types import Scope
 
 from lipcore.extras import EXTRAS, install_line, is_installed
 from service import __version__
 from service.api.access.scopes import needs
 from service.api.dependencies import ReadinessDep, of_app
 from service.api.errors import responses
-from service.api.route import Route
+from service.api.route import Reply, Route
 from service.contract.health import Health, Live, Missing, Part, Ready
 from service.foundation.errors import NotReadyError, problem
 
@@ -40,6 +41,11 @@ def _missing() -> Iterator[Missing]:
     for name, there in _can():
         if not there:
             yield Missing(extra=name, gives=EXTRAS[name].gives, install=install_line(name))
+
+
+async def answer_live(scope: Scope, body: bytes) -> Reply:
+    """Answer `live` in the event loop of another process."""
+    return Reply(Live().model_dump_json().encode())
 
 
 @router.get("/live", summary="Check that the process is alive")

@@ -56,7 +56,7 @@ async def echo(request: Request) -> Response:
     Use it to measure latency: the echo takes the time of HTTP and of the client. The extra time of a query is the
     computation. JSON is returned as JSON, anything else as `application/octet-stream`.
     """
-    # requests with a media type are answered by `answer_echo`. Octets: the body must never be shown as a page of the service
+    # requests with a media type are answered by `answer_echo`. Octets: the body must never be shown as a page
     return Reply(await request.body(), OCTETS).response()
 
 

@@ -23,7 +23,7 @@ from websockets.protocol import State
 
 from service.api.errors import refuse
 from service.api.limits.requests import HEALTH, PATIENCE, ClientPatience
-from service.api.server.connection_limit import ConnectionLimit
+from service.api.server.connection_limit import ConnectionLimit, OtherConnections
 from service.foundation.errors import BusyError, ErrorBody, ErrorResponse
 from service.foundation.settings import Settings
 
@@ -227,13 +227,15 @@ def guarded(
     settings: Settings,
     patience: ClientPatience = PATIENCE,
     kind: type[Guarded] = GuardedProtocol,  # type: ignore[assignment]
+    others: OtherConnections | None = None,
     **fields: Any,
 ) -> type[Guarded]:
     """Return a connection class with the limits of the settings, for `uvicorn.Config(http=...)`.
 
-    kind: its base class; fields: further class variables.
+    kind: its base class; others: see `ConnectionLimit`; fields: further class variables.
     """
-    return type(kind.__name__, (kind,), {"patience": patience, "limit": ConnectionLimit(settings), **fields})
+    limit = ConnectionLimit(settings, others)
+    return type(kind.__name__, (kind,), {"patience": patience, "limit": limit, **fields})
 
 
 CONNECTION = "lipserve.connection"

@@ -18,8 +18,8 @@ from lipcore.data.samples import Array
 from service.api.errors import UNEXPECTED_ERROR
 from service.contract.frames import NUMBER, REQUEST
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
-from service.learning.ingest.clock import MIN_STEP_S
 from service.foundation.settings import Settings
+from service.learning.ingest.clock import MIN_STEP_S
 from service.learning.ingest.frames import Frames, FramesResult
 from service.models.served import AnsweringModels, ServedModel
 from service.storage.errors import translate_error

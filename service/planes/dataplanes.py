@@ -1,0 +1,108 @@
+"""The control plane's ends of the channels to the data planes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from functools import partial
+from typing import Any
+
+from fastapi import FastAPI
+from uvicorn.server import Server
+
+from service.api.server.connections import guarded
+from service.foundation.errors import ServiceError
+from service.learning.learners import Learners
+from service.models.loaded import LoadedModels
+from service.planes.channel import Channel
+from service.planes.connections import ControlProtocol
+from service.planes.counting import AdoptedConnections, ShedConnection
+from service.planes.frames import FramesToLog, log_frames
+from service.planes.handover import Handed, adopt, pass_on
+from service.planes.publisher import Publisher
+
+logger = logging.getLogger(__name__)
+
+
+class DataPlanes:
+    """The data planes: the one that answers, its spare, and those that came before. Make it in the event loop.
+
+    server: serves the connections that they pass on.
+    """
+
+    def __init__(self, app: FastAPI, server: Server) -> None:
+        self._app, self._server, self._loop = app, server, asyncio.get_running_loop()
+        self._channels: set[Channel] = set()
+        self._answering: Channel | None = None
+        kind = guarded(app.state.storage.settings, kind=ControlProtocol, data=self._pass_back)
+        self._protocol = partial(
+            kind, config=server.config, server_state=server.server_state, app_state=server.lifespan.state
+        )
+        self._connections = AdoptedConnections(kind.limit, server.server_state.connections, self._broadcast)
+        self._reporting = self._loop.create_task(self._connections.report())
+
+    def add(self, channel: Channel) -> None:
+        """Publish to a data plane and do what it asks for, until it is gone. From any thread."""
+        self._loop.call_soon_threadsafe(self._join, channel)
+        Publisher(self._app, channel).start()
+        threading.Thread(target=self._receive, args=(channel,), daemon=True, name="data plane").start()
+
+    def _receive(self, channel: Channel) -> None:
+        while (received := channel.receive()) is not None:
+            try:
+                self._handle(channel, *received)
+            except Exception:
+                logger.exception("could not handle a message of the data plane")
+        self._loop.call_soon_threadsafe(self._leave, channel)
+
+    def _join(self, channel: Channel) -> None:
+        self._channels.add(channel)
+        channel.send(self._connections.sent, wait=False)
+
+    def _leave(self, channel: Channel) -> None:
+        self._channels.discard(channel)
+        if self._answering is channel:
+            self._answering, self._connections.through = None, 0
+        channel.close()
+
+    def _handle(self, channel: Channel, message: Any, fds: list[int]) -> None:
+        learners: Learners = self._app.state.learners
+        match message:
+            case Handed():
+                asyncio.run_coroutine_threadsafe(self._adopt(channel, message, fds[0]), self._loop)
+            case FramesToLog():
+                asyncio.run_coroutine_threadsafe(_log(learners, channel, message), self._loop)
+            case ShedConnection():
+                self._loop.call_soon_threadsafe(self._connections.shed, message)
+            case ("load", model, version, alias):
+                threading.Thread(target=_load, args=(learners.loaded, model, version, alias), daemon=True).start()
+            case ("meters", given):
+                self._app.state.data_meters = given
+
+    async def _adopt(self, channel: Channel, handed: Handed, fd: int) -> None:
+        self._answering = channel
+        self._connections.through = handed.number
+        await adopt(fd, partial(self._protocol, handed=handed))
+
+    def _pass_back(self, transport: asyncio.Transport, handed: Handed, peer: str | None) -> bool:
+        channel = self._answering
+        if channel is None:
+            return False
+        return pass_on(transport, handed, lambda fd, message: channel.send(message, [fd], wait=False))
+
+    def _broadcast(self, message: Any) -> None:
+        for channel in self._channels:
+            channel.send(message, wait=False)
+
+
+def _load(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> None:
+    try:
+        loaded.get(model, version, alias)
+    except ServiceError:
+        logger.debug("model %s cannot be loaded for the data plane", model)
+
+
+async def _log(learners: Learners, channel: Channel, message: FramesToLog) -> None:
+    logged = await log_frames(learners, message)
+    await asyncio.to_thread(channel.send, logged)
