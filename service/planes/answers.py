@@ -16,10 +16,10 @@ from service.api.access.scopes import Rules
 from service.api.errors import refuse, unexpected_error
 from service.api.limits.rates import RateLimit
 from service.api.limits.requests import MAX_REQUESTS, Gate
-from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
-from service.api.route import Answerer
 from service.api.oip import routes as oip
 from service.api.oip.statistics import Statistics
+from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
+from service.api.route import Answerer
 from service.api.routes import health, predictions
 from service.api.server.connections import CONNECTION as STREAM
 from service.api.shared import Shared
