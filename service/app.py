@@ -99,7 +99,7 @@ def create_app(settings: Settings | None = None, shared: Shared | None = None) -
                     await serving.enter_async_context(keyring.watching(storage.database))
                 await serving.enter_async_context(clean_hourly(storage.database, settings))
                 if calls:
-                    await serving.enter_async_context(_calls(app, settings, stopping))
+                    await serving.enter_async_context(_calls(app, settings, stopping, shared))
                 webhook.start()
                 yield
         finally:
@@ -160,10 +160,10 @@ def _calls_route() -> BaseRoute:
     return Methods()
 
 
-def _calls(app: FastAPI, settings: Settings, stopping: StopState) -> AbstractAsyncContextManager[int]:
+def _calls(app: FastAPI, settings: Settings, stopping: StopState, shared: Shared) -> AbstractAsyncContextManager[int]:
     from service.api.oip.rpc.listening import listening  # noqa: PLC0415 - of an extra
 
-    return listening(app, settings, stopping)
+    return listening(app, settings, stopping, shared.calls)
 
 
 def _add_middleware(

@@ -33,6 +33,8 @@ def serve(
     sockets.check_port(settings.host, settings.port)
     start_logs(settings)
     check_home(settings)  # before the app opens it, so that errors are printed without a traceback
+    rpc.check_installed(settings)
+    rpc.check_port(settings)
     if settings.data_plane and sys.platform == "linux":
         from service.planes import supervisor  # noqa: PLC0415
 
@@ -40,7 +42,6 @@ def serve(
         return
     limit_free_memory()
     served = create_app(settings)
-    rpc.check_port(settings)
     config = uvicorn.Config(
         served,
         host=settings.host,

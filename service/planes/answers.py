@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from starlette.datastructures import State
-from starlette.routing import compile_path
+from starlette.routing import BaseRoute, compile_path
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.api.access.keys import Keyring
@@ -70,15 +70,18 @@ class Paths(Generic[Found]):
 class DataApp:
     """The application of the data plane. It hands over what it cannot answer, errors included.
 
-    state: what routes and middleware read, as in the state of the control plane's application.
+    state: what routes and middleware read, as in the state of the control plane's application. further: routes whose
+    requests have an application of their own.
     """
 
     exception_handlers: ClassVar[dict[type[Exception], Any]] = {Exception: unexpected_error}
 
-    def __init__(self, learners: RemoteLearners, meters: Meters, shared: Shared) -> None:
+    def __init__(
+        self, learners: RemoteLearners, meters: Meters, shared: Shared, further: Sequence[BaseRoute] = ()
+    ) -> None:
         admitted = shared.counters.gauge("admitted streams")
         declared = [predictions.hot, predictions.echo_hot, oip.hot, health.router, stream.router(admitted)]
-        rules = Rules([route for each in declared for route in each.routes])
+        rules = Rules([*(route for each in declared for route in each.routes), *further])
         self.state = State({"loaded": learners.loaded, "learners": learners, "meters": meters, "rules": rules})
         self.state.sequences, self.state.statistics = shared.sequences, Statistics(shared.counters)
         counter = stream.Streams(admitted)
@@ -130,10 +133,18 @@ class DataApp:
 
 
 def with_middleware(
-    app: DataApp, settings: Settings, keyring: Keyring | None, meters: Meters, shared: Shared
+    app: DataApp,
+    settings: Settings,
+    keyring: Keyring | None,
+    meters: Meters,
+    shared: Shared,
+    inner: ASGIApp | None = None,
 ) -> ASGIApp:
-    """Return the application below the middleware that queries pass in the control plane too."""
-    wrapped: ASGIApp = app
+    """Return the application below the middleware that queries pass in the control plane too.
+
+    inner: answers requests instead of the application, of which only the state is read.
+    """
+    wrapped: ASGIApp = app if inner is None else inner
     if settings.max_requests_per_s is not None:
         wrapped = RateLimit(wrapped, settings.max_requests_per_s, settings.max_request_burst, shared.buckets)
     wrapped = LocalAccess(wrapped) if keyring is None else KeyAccess(wrapped, keyring)

@@ -8,12 +8,14 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from struct import Struct
 from typing import Any
 
 import uvicorn
+from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
 from service.api.access.keys import REFRESH_S, Keyring
@@ -47,13 +49,14 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any, m
     burst = settings.max_request_burst
     keyring = Keyring(REFRESH_S, burst, shared.counters, shared.buckets) if settings.keys_needed else None
     control, meters = ControlLink(settings, link, keyring), Meters(counters=shared.counters)
+    further = _routes_of_calls(settings)
     control.published.wait()
     held = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
     fcntl.flock(held, fcntl.LOCK_EX)  # the kernel frees it the moment the process that held it is gone
     logger.info("process %d is the data plane", os.getpid())
     for other in DATA_PARTS - {part}:
         shared.counters.clear_gauges(other)
-    app = DataApp(control.learners, meters, shared)
+    app = DataApp(control.learners, meters, shared, further)
     made: Any = guarded(settings, kind=DataProtocol, others=control.passed, control=control.pass_on)
     config = uvicorn.Config(
         with_middleware(app, settings, keyring, meters, shared),
@@ -79,13 +82,32 @@ def run(settings: Settings, listener: Any, link: Path, lock: Path, beats: Any, m
         BEAT.pack_into(beats, 0, os.getpid(), number)
         asyncio.get_running_loop().call_later(BEAT_S, beat, number + 1)
 
+    if further:
+        from service.planes.calls import serving_calls  # noqa: PLC0415 - of an extra, and only after the fork
+
+        server.calls = serving_calls(app, settings, keyring, meters, shared, server.stopping)
     server.begun = begin
     server.run([listener])
 
 
+def _routes_of_calls(settings: Settings) -> list[BaseRoute]:
+    """Return the routes of gRPC calls, if there are any."""
+    if settings.grpc_port is None:
+        return []
+    from service.api.oip.rpc.methods import Methods  # noqa: PLC0415
+
+    return [Methods()]
+
+
 class _Server(sockets.Server):
     begun: Callable[[], None]
+    calls: AbstractAsyncContextManager[None] = nullcontext()
 
     async def startup(self, sockets: Any = None) -> None:
+        await self.calls.__aenter__()
         await super().startup(sockets)
         self.begun()
+
+    async def shutdown(self, sockets: Any = None) -> None:
+        await super().shutdown(sockets)
+        await self.calls.__aexit__(None, None, None)
