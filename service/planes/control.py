@@ -19,18 +19,20 @@ from service.app import create_app
 from service.foundation.settings import Settings
 from service.planes.channel import Channel
 from service.planes.dataplanes import DataPlanes
+from service.planes.inheritance import CONTROL_PART, Inheritance
 from service.planes.pulse import BEAT_S, Plane, Pulse
 from service.runtime import nursery
 from service.runtime.allocator import limit_free_memory
 
 
-def run(settings: Settings, link: socket.socket, pulse: Pulse) -> None:
-    """Serve all routes to the data planes that connect to `link`, until SIGTERM."""
+def run(inherited: Inheritance) -> None:
+    """Serve all routes to the data planes that connect, until SIGTERM."""
+    inherited.close_listeners()
     nursery.start()
     multiprocessing.current_process().name = "MainProcess"  # the log does not mention it
     limit_free_memory()
-    app = create_app(settings)
-    ControlServer(app, settings, link, pulse).run()
+    app = create_app(inherited.settings, inherited.memory.join(CONTROL_PART))
+    ControlServer(app, inherited.settings, inherited.accepting, inherited.pulse).run()
 
 
 class ControlServer(sockets.Server):
@@ -41,7 +43,7 @@ class ControlServer(sockets.Server):
 
     def __init__(self, app: FastAPI, settings: Settings, link: socket.socket, pulse: Pulse) -> None:
         super().__init__(configure_server(app, settings), None, app.state.stopping, notice_s=0.0)
-        self.app, self.link, self._pulse = app, link, pulse
+        self.app, self._link, self._pulse = app, link, pulse
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Open the application, then accept data planes."""
@@ -66,7 +68,7 @@ class ControlServer(sockets.Server):
 
     def _accept(self) -> None:
         while True:
-            connection, _ = self.link.accept()
+            connection, _ = self._link.accept()
             if is_own(connection):
                 self._planes.add(Channel(connection))
             else:
