@@ -130,7 +130,7 @@ def _become_fifo(priority: int, inherit: bool) -> int | Refusal:
     return Refusal(
         "policy",
         "RLIMIT_RTPRIO is 0 and CAP_SYS_NICE is missing",
-        "Docker: `--ulimit rtprio=99`, for root also `--cap-add SYS_NICE`. systemd: `LimitRTPRIO=99`. "
+        "Docker: `--ulimit rtprio=99` or, for root, `--cap-add SYS_NICE`. systemd: `LimitRTPRIO=99`. "
         "Login: `@realtime - rtprio 99` in /etc/security/limits.conf.",
     )
 
@@ -174,7 +174,7 @@ def _refused_lock() -> Refusal | None:
     return Refusal(
         "pages",
         f"RLIMIT_MEMLOCK is {limit // 1024} KiB and CAP_IPC_LOCK is missing",
-        "Docker: `--ulimit memlock=-1`. systemd: `LimitMEMLOCK=infinity`. "
+        "Docker: `--ulimit memlock=-1` or, for root, `--cap-add IPC_LOCK`. systemd: `LimitMEMLOCK=infinity`. "
         "Login: `@realtime - memlock unlimited` in /etc/security/limits.conf.",
     )
 
