@@ -134,7 +134,7 @@ RATE = "Highest loop rate"
 IN_PROCESS = "Or load the model in the controller's process, or export C (docs/control-loop.md)."
 SLOW_SERVICE = "The service or the network is late, not the model. Stop other work on both machines. "
 ADVICE: dict[tuple[str, Policy], str] = {
-    ("wake-up", "plain"): "Run the controller with SCHED_FIFO (`chrt -f 20 …`).",
+    ("wake-up", "plain"): "Permit SCHED_FIFO, and run the controller with it (`chrt -f 20 …`).",
     ("wake-up", "SCHED_FIFO"): "No controller on this machine is faster. Follow the warnings, or use a slower loop.",
     **{("echo", policy): SLOW_SERVICE + IN_PROCESS for policy in ("plain", "SCHED_FIFO")},
     **{

@@ -16,7 +16,7 @@ from service.runtime import realtime
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="SCHED_FIFO and /proc are Linux")
 
 ENTER = """
-import json, os, resource, sys, threading
+import json, mmap, os, resource, sys, threading
 from dataclasses import asdict
 from pathlib import Path
 from service.runtime import realtime
@@ -47,6 +47,7 @@ def kernel():
         "reset_on_fork": bool(policy & os.SCHED_RESET_ON_FORK),
         "priority": os.sched_getparam(0).sched_priority,
         "locked_kib": int(status["VmLck"].split()[0]),
+        "resident_kib": int(status["VmRSS"].split()[0]),
         "cpus": sorted(os.sched_getaffinity(0)),
     }
 
@@ -60,6 +61,7 @@ def in_child():
 
 told, started = {}, []
 probed = realtime.probe_real_time()
+unused = mmap.mmap(-1, 256 << 20)
 told["after_probe"] = kernel()
 granted = realtime.enter_real_time(**case.get("arguments", {}))
 told["kernel"] = kernel()
@@ -114,6 +116,7 @@ def assert_consistent(told, arguments):
         for heir in (told["thread"], told["child"]):
             assert (heir["policy"], heir["priority"]) == (os.SCHED_OTHER, 0)
     assert told["child"]["locked_kib"] == 0
+    assert kernel["resident_kib"] < told["after_probe"]["resident_kib"] + 128 * 1024  # unused memory is not filled
 
 
 IS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
