@@ -21,7 +21,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 PRIORITY = 10
 """Priority of SCHED_FIFO: below the interrupt threads of a PREEMPT_RT kernel (50) and below the usual 80 to 99 of a
@@ -32,7 +32,8 @@ _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _MLOCK_ONFAULT = 1
 
 
-class Refusal(NamedTuple):
+@dataclass(frozen=True)
+class Refusal:
     """What the system refuses, why, and what to do."""
 
     what: Literal["policy", "pages"]
@@ -50,7 +51,7 @@ class RealTime:
     """Priority of SCHED_FIFO, 1 to 99; 0 for the usual policy."""
     pages_locked: bool = False
     """Whether pages of the process stay in memory."""
-    cpus: frozenset[int] | None = None
+    cpus: tuple[int, ...] | None = None
     """Isolated CPU that the thread is pinned to; None if it may use all CPUs of the process."""
     refusals: tuple[Refusal, ...] = ()
 
@@ -61,7 +62,8 @@ _NO_LINUX = RealTime(refusals=(Refusal("policy", "the system is not Linux", "Run
 def enter_real_time(priority: int = PRIORITY, lock_pages: bool = True, inherit: bool = False) -> RealTime:
     """Give the calling thread real-time priority and lock the pages of its process, as far as that is permitted.
 
-    Call it after the threads that help this one are started: a thread inherits a pinned CPU.
+    Call it after the threads that help this one are started: a thread inherits a pinned CPU. Keep their work short:
+    while one of them holds Python's lock, this thread waits for it at plain priority.
 
     Args:
         priority: Priority of SCHED_FIFO, 1 to 99. A lower one is used if the limit is lower.
@@ -194,14 +196,14 @@ def _can_lock(size: int) -> bool:
     return bool(refused == 0)
 
 
-def _pin() -> frozenset[int] | None:
+def _pin() -> tuple[int, ...] | None:
     """Pin the calling thread to the first isolated CPU that it may use; return it."""
     allowed = os.sched_getaffinity(0)
     isolated = sorted(allowed & read_cpus(_ISOLATED))
     if not isolated or len(allowed) == 1:
         return None
     os.sched_setaffinity(0, isolated[:1])
-    return frozenset(isolated[:1])
+    return (isolated[0],)
 
 
 def read_cpus(path: Path) -> set[int]:

@@ -96,25 +96,24 @@ def _loops(granted: RealTime, service: str | None, model: str | None, seconds: f
 
     policies: list[Policy] = ["plain", "SCHED_FIFO"] if granted.policy == "fifo" else ["plain"]
     rates = f"{', '.join(map(str, RATES_HZ))} Hz, {seconds:g} s each"
+    note(f"measuring wake-ups at {rates}")
+    for policy in policies:
+        yield from wake_ups(policy, seconds)
     if service is None:
-        note(f"measuring wake-ups at {rates}")
-        for policy in policies:
-            yield from wake_ups(policy, seconds)
         return
+    note(f"measuring answers of {service}")
     best = policies[-1]
     with connected(service) as client:
         motions = np.zeros((1, 3, JOINTS)) if model is None else random_motions(client, model, MOTIONS)[1]
-        note(f"measuring wake-ups at {rates}")
-        for policy in policies:
-            yield from wake_ups(policy, seconds)
-        note(f"measuring answers of {service}")
-        yield from answers("echo", best, seconds, lambda: EchoClient("echo", service), motions)
+        yield from answers("echo", best, seconds, lambda: EchoClient("echo", service, timeout=TIMEOUT_S), motions)
         if model is not None:
-            yield from answers("torque", best, seconds, lambda: client.stream(model), motions)
+            yield from answers("torque", best, seconds, lambda: client.stream(model, timeout=TIMEOUT_S), motions)
 
 
 JOINTS, MOTIONS = 7, 1000
 """Joints of an echoed query if no model is given, and number of different motions."""
+TIMEOUT_S = 10.0
+"""Time after which a missing answer is an error, s."""
 
 
 def _rates(loops: Sequence[Loop]) -> Iterator[Finding]:

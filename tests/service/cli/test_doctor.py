@@ -4,13 +4,14 @@ import gc
 import gzip
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from service.cli.doctor import clocks, loops, processor, resources
+from service.cli.doctor import clocks, command, loops, processor, resources
 from service.cli.doctor.findings import System
 from service.foundation.settings import Settings
 from service.runtime.realtime import RealTime, Refusal, probe_real_time
@@ -220,7 +221,7 @@ def test_limit_of_open_files_is_compared_with_connections(monkeypatch):
 @pytest.mark.parametrize(
     ("granted", "verdicts", "advice"),
     [
-        (RealTime("fifo", 10, True, frozenset({3})), ["ok", "ok"], ""),
+        (RealTime("fifo", 10, True, (3,)), ["ok", "ok"], ""),
         (
             RealTime(refusals=(Refusal("policy", "no permission", "Ask."), Refusal("pages", "too few", "Raise."))),
             ["warning", "warning"],
@@ -332,7 +333,8 @@ def test_rate_is_held_if_999_of_1000_ticks_are_in_time():
     assert loops.highest_rate([loop(100, 5)]) is None
 
 
-def test_loops_run_at_their_policy_and_collect_no_garbage():
+def test_loops_run_at_their_policy_and_collect_no_garbage(monkeypatch):
+    ExactClock(monkeypatch)
     seen = []
     with loops.ThreadPoolExecutor(1, initializer=loops.initializer_of("plain")) as thread:
         thread.submit(loops.run_loop, 1000, 0.002, lambda: seen.append(gc.isenabled())).result()
@@ -369,6 +371,14 @@ def test_machine_is_examined_without_a_service(lipserve):
         held = [each["rate_hz"] for each in told["loops"] if (each["policy"], each["verdict"]) == (policy, "ok")]
         (rate,) = (each for each in told["findings"] if each["name"] == f"wake-up, {policy}")
         assert rate["value"].startswith(f"{max(held)} Hz" if held else "none of")
+
+
+@pytest.mark.usefixtures("in_home")
+def test_grants_and_refusals_are_printed_as_json(lipserve, monkeypatch):
+    for granted in (RealTime("other", 0, True, (1,)), RealTime(refusals=(Refusal("pages", "too few", "Raise."),))):
+        monkeypatch.setattr(command, "probe_real_time", lambda granted=granted: granted)
+        told = json.loads(lipserve("doctor", "--seconds", 0.05, "--json")[1])["real_time"]
+        assert told == json.loads(json.dumps(asdict(granted)))
 
 
 @pytest.mark.usefixtures("in_home")
