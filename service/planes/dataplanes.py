@@ -48,6 +48,12 @@ class DataPlanes:
         Publisher(self._app, channel).start()
         threading.Thread(target=self._receive, args=(channel,), daemon=True, name="data plane").start()
 
+    def close(self) -> None:
+        """Stop reporting, and close the channels."""
+        self._reporting.cancel()
+        for channel in tuple(self._channels):
+            channel.close()
+
     def _receive(self, channel: Channel) -> None:
         while (received := channel.receive()) is not None:
             try:
@@ -74,7 +80,7 @@ class DataPlanes:
             case FramesToLog():
                 asyncio.run_coroutine_threadsafe(_log(learners, channel, message), self._loop)
             case ShedConnection():
-                self._loop.call_soon_threadsafe(self._connections.shed, message)
+                self._loop.call_soon_threadsafe(self._shed, channel, message)
             case ("load", model, version, alias):
                 threading.Thread(target=_load, args=(learners.loaded, model, version, alias), daemon=True).start()
             case ("meters", given):
@@ -91,8 +97,11 @@ class DataPlanes:
             return False
         return pass_on(transport, handed, lambda fd, message: channel.send(message, [fd], wait=False))
 
+    def _shed(self, channel: Channel, asked: ShedConnection) -> None:
+        channel.send(self._connections.shed(asked), wait=False)
+
     def _broadcast(self, message: Any) -> None:
-        for channel in self._channels:
+        for channel in tuple(self._channels):
             channel.send(message, wait=False)
 
 

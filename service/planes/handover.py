@@ -34,7 +34,8 @@ _QUERY = re.compile(
 )
 _STREAM = re.compile(rb"GET /v1/(?:models/[^/ ?]+|echo)/stream(?:\?[^ ]*)? HTTP/1\.1\r\n")
 _HEADERS = re.compile(rb"(?:[!-9;-~]+:[^\x00-\x08\x0a-\x1f\x7f]*\r\n)*\r\n")
-_LENGTH = re.compile(rb"\r\ncontent-length:[ \t]*(\d{1,9})[ \t]*\r\n", re.IGNORECASE)
+_LENGTH = re.compile(rb"\r\ncontent-length:([^\r]*)", re.IGNORECASE)
+_NUMBER = re.compile(rb"[ \t]*(\d{1,9})[ \t]*")
 _BODY = re.compile(rb"\r\n(?:transfer-encoding|content-length|content-encoding|expect):", re.IGNORECASE)
 _ELSE = re.compile(rb"\r\n(?:transfer-encoding|content-encoding|expect|upgrade):", re.IGNORECASE)
 
@@ -53,10 +54,11 @@ def find_query(data: bytes) -> int:
         return OTHER
     if line.re is _STREAM:
         return OTHER if _BODY.search(data, 0, end) else len(data)
-    lengths = _LENGTH.findall(data, 0, end)
-    if len(lengths) > 1 or _ELSE.search(data, 0, end):
+    lengths = _LENGTH.findall(data, 0, end) or [b"0"]
+    number = _NUMBER.fullmatch(lengths[0])
+    if number is None or len(lengths) > 1 or _ELSE.search(data, 0, end):
         return OTHER
-    size = end + int(lengths[0]) if lengths else end
+    size = end + int(number[1])
     if size > MAX_QUERY_BYTES:
         return OTHER
     return size if size <= len(data) else PART

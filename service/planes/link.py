@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 from service.api.access.keys import Keyring
 from service.foundation.settings import Settings
 from service.planes.channel import Channel
-from service.planes.counting import ConnectionReport, NoneIdle, PassedConnections
+from service.planes.counting import ConnectionReport, ConnectionShed, PassedConnections
 from service.planes.frames import FramesLogged, RemoteLearners
 from service.planes.handover import Handed, adopt, pass_on
 from service.planes.published import PublishedModels
@@ -38,7 +39,7 @@ class ControlLink:
         self.published = threading.Event()
         self.learners = RemoteLearners(settings, self.loaded, self._send_at_once)
         self.passed = PassedConnections(self._send_at_once)
-        self._path = path
+        self._path, self._closed = path, False
         self._channel: Channel | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._protocol: Callable[..., asyncio.Protocol] | None = None
@@ -48,6 +49,12 @@ class ControlLink:
         """Begin to answer, in the running event loop. protocol: returns a `DataProtocol`; its argument is `handed`."""
         self._protocol = protocol
         self._loop = asyncio.get_running_loop()
+
+    def close(self) -> None:
+        """Close the channel for good."""
+        self._closed = True
+        if (channel := self._channel) is not None:
+            channel.close()
 
     def pass_on(self, transport: asyncio.Transport, handed: Handed, peer: str | None) -> bool:
         """Pass a connection to the control plane, see `PassOn`."""
@@ -72,7 +79,7 @@ class ControlLink:
         return channel is not None and channel.send(message, fds, wait)
 
     def _run(self) -> None:
-        while True:
+        while not self._closed:
             try:
                 self._channel = channel = Channel.connect(self._path)
             except OSError:
@@ -98,8 +105,8 @@ class ControlLink:
                 self._on_loop(self.learners.receive, message)
             case ConnectionReport():
                 self._on_loop(self.passed.update, message)
-            case NoneIdle():
-                self._on_loop(self.passed.note_busy)
+            case ConnectionShed():
+                self._on_loop(self.passed.receive, message)
             case ("published",):
                 self.published.set()
             case ("keys", keys) if self.keyring is not None:
@@ -119,4 +126,5 @@ class ControlLink:
 
     def _on_loop(self, call: Callable[..., None], *given: Any) -> None:
         if self._loop is not None:
-            self._loop.call_soon_threadsafe(call, *given)
+            with suppress(RuntimeError):  # closed: this process ends
+                self._loop.call_soon_threadsafe(call, *given)

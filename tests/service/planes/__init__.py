@@ -1,1 +1,1 @@
-"""The two planes of the service."""
+"""Tests of both planes: connections, frames and publications."""
