@@ -54,6 +54,8 @@ def test_replaced_methods_exist(kind):
 def test_message_of_a_start_names_the_address(caplog):
     """The data plane logs it itself, as uvicorn logs none for listeners that it is given."""
     caplog.set_level("INFO")
+    config = uvicorn.Config(print, port=0, lifespan="off", log_config=None)
+    config.load()
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        DataServer(uvicorn.Config(None, port=0), None, 0.0, Pulse())._log_started_message([listener])
+        DataServer(config, None, 0.0, Pulse())._log_started_message([listener])
         assert f"running on http://127.0.0.1:{listener.getsockname()[1]}" in caplog.text
