@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
@@ -129,24 +129,24 @@ class Traffic(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
         requests, streams = self._meters.requests, self._meters.streams()
-        seen = {Kind(*key): durations for key, durations in list(requests.known.items())}
+        seen = requests.totals()
         yield self.duration.spread(_grouped(seen, lambda kind: (kind.method, kind.route, kind.model)))
         answers = _grouped(seen, lambda kind: (kind.method, kind.route, str(kind.status)))
         yield self.requests.of((labels, sum(each.counts)) for labels, each in answers)
         refused = {kind: durations for kind, durations in seen.items() if kind.code}
         errors = _grouped(refused, lambda kind: (kind.route, kind.code))
         yield self.errors.of((labels, sum(each.counts)) for labels, each in errors)
-        yield self.in_flight.of([((), requests.in_flight)])
-        yield self.streams.of([((), requests.streams)])
+        yield self.in_flight.of([((), requests.in_flight.total)])
+        yield self.streams.of([((), requests.streams.total)])
         yield self.frames.spread(([model], meter.durations) for model, meter in streams.items())
         yield self.late.of(([model], meter.late) for model, meter in streams.items())
         yield self.frame_errors.of(
-            ([model, code], count) for model, meter in streams.items() for code, count in dict(meter.refused).items()
+            ([model, code], count) for model, meter in streams.items() for code, count in meter.refused.items()
         )
 
 
 def _grouped(
-    seen: dict[Kind, Durations], labels: Callable[[Kind], tuple[str, ...]]
+    seen: Mapping[Kind, Durations], labels: Callable[[Kind], tuple[str, ...]]
 ) -> list[tuple[tuple[str, ...], Durations]]:
     groups: dict[tuple[str, ...], list[Durations]] = defaultdict(list)
     for kind, durations in seen.items():

@@ -1,9 +1,8 @@
-"""The control plane's end: it publishes what answers, and does what the data plane asks for."""
+"""The process of the control plane: it answers all routes, and publishes what answers to the data plane."""
 
 from __future__ import annotations
 
 import asyncio
-import logging
 import multiprocessing
 import os
 import signal
@@ -20,20 +19,20 @@ from service.app import create_app
 from service.foundation.settings import Settings
 from service.planes.channel import Channel
 from service.planes.dataplanes import DataPlanes
+from service.planes.inheritance import CONTROL_PART, Inheritance
 from service.planes.pulse import BEAT_S, Plane, Pulse
 from service.runtime import nursery
 from service.runtime.allocator import limit_free_memory
 
-logger = logging.getLogger(__name__)
 
-
-def run(settings: Settings, link: socket.socket, pulse: Pulse) -> None:
-    """Serve all routes to the data planes that connect to `link`, until SIGTERM."""
+def run(inherited: Inheritance) -> None:
+    """Serve all routes to the data planes that connect, until SIGTERM."""
+    inherited.close_listeners()
     nursery.start()
     multiprocessing.current_process().name = "MainProcess"  # the log does not mention it
     limit_free_memory()
-    app = create_app(settings)
-    ControlServer(app, settings, link, pulse).run()
+    app = create_app(inherited.settings, inherited.memory.join(CONTROL_PART))
+    ControlServer(app, inherited.settings, inherited.accepting, inherited.pulse).run()
 
 
 class ControlServer(sockets.Server):
@@ -44,16 +43,16 @@ class ControlServer(sockets.Server):
 
     def __init__(self, app: FastAPI, settings: Settings, link: socket.socket, pulse: Pulse) -> None:
         super().__init__(configure_server(app, settings), None, app.state.stopping, notice_s=0.0)
-        self.app, self.link, self._pulse = app, link, pulse
+        self.app, self._link, self._pulse = app, link, pulse
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Open the application, then accept data planes."""
         await super().startup([])
         self.app.state.readiness.add("planes", self._pulse.check)
-        self._planes = DataPlanes(self.app, self)
         self._loop = asyncio.get_running_loop()
         self._loop.add_signal_handler(signal.SIGUSR1, self._announce_stop)
         self._beat()
+        self._planes = DataPlanes(self.app, self)
         threading.Thread(target=self._accept, daemon=True).start()
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
@@ -69,16 +68,15 @@ class ControlServer(sockets.Server):
 
     def _accept(self) -> None:
         while True:
-            connection, _ = self.link.accept()
-            if not is_own(connection):
+            connection, _ = self._link.accept()
+            if is_own(connection):
+                self._planes.add(Channel(connection))
+            else:
                 connection.close()
-                continue
-            self._planes.add(Channel(connection))
 
 
 def is_own(connection: socket.socket) -> bool:
     """Return whether the process at the other end of a Unix-domain socket has the user of this one."""
-    _, user, _ = struct.unpack(
-        "3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    )
-    return bool(user == os.getuid())
+    format_ = "3i"  # process, user, group
+    found = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize(format_))
+    return bool(struct.unpack(format_, found)[1] == os.getuid())

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import gc
 import logging
 import os
 import socket
 import sys
 from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, nullcontext
 from functools import partial
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import uvicorn
+from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
 from lipcore.posterior.threads import limit_threads
@@ -26,10 +28,12 @@ from service.api.server.sockets import UnixSocket
 from service.foundation.settings import Settings
 from service.planes.answers import DataApp, with_middleware
 from service.planes.connections import DataProtocol, DataStream
+from service.planes.inheritance import DATA_PARTS, Inheritance
 from service.planes.link import ControlLink
 from service.planes.pulse import BEAT_S, Plane, Pulse
 from service.runtime import forking
 from service.runtime.process import SERVING_THREADS
+from service.runtime.realtime import RealTime, enter_real_time
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import StopState
 
@@ -38,39 +42,73 @@ DRAIN_S = 2
 """Max wait for running requests when the data plane stops, s: they take milliseconds, and streams are closed."""
 
 
-def run(
-    settings: Settings, listener: socket.socket, unix: UnixSocket | None, link: Path, lock: int, pulse: Pulse
-) -> None:
-    """Follow the control plane; answer once no other data plane lives.
-
-    lock: descriptor of a file. The data plane that answers has locked it; the kernel unlocks it when that process ends.
-    """
+def run(inherited: Inheritance, part: int) -> None:
+    """Follow the control plane; answer once no other data plane lives. part: of this process in the shared memory."""
+    inherited.accepting.close()
+    settings, shared = inherited.settings, inherited.memory.join(part)
     sys.setswitchinterval(3e-5)
     threadpool_limits(SERVING_THREADS)
     limit_threads(SERVING_THREADS)
-    keyring = Keyring(REFRESH_S, settings.max_request_burst) if settings.keys_needed else None
-    control, meters = ControlLink(settings, link, keyring), Meters()
+    burst = settings.max_request_burst
+    keyring = Keyring(REFRESH_S, burst, shared.counters, shared.buckets) if settings.keys_needed else None
+    control, meters = ControlLink(settings, inherited.link, keyring), Meters(counters=shared.counters)
+    routes = _routes_of_calls(settings)
     control.published.wait()
-    held = os.open(f"/proc/self/fd/{lock}", os.O_RDWR)  # opened anew: a lock belongs to an opened file
+    held = os.open(f"/proc/self/fd/{inherited.lock}", os.O_RDWR)  # opened anew: a lock belongs to an opened file
     fcntl.flock(held, fcntl.LOCK_EX)
     forking.rename("data")
-    wrapped = with_middleware(DataApp(control.learners, meters), settings, keyring, meters)
-    ends: dict[str, Any] = {"passed": control.passed, "control": control.pass_on}
-    http = guarded(settings, kind=DataProtocol, others=control.passed, **ends)
-    ws = type("DataStream", (DataStream,), {"control": control.pass_on})
-    # port 0: uvicorn then logs the port that the system has chosen
-    options = {"http": http, "ws": ws, "port": 0, "lifespan": "off", "timeout_graceful_shutdown": DRAIN_S}
-    config = configure_server(wrapped, settings, **options)
-    server = DataServer(config, unix, settings.stop_notice_s, pulse)
-    server.when_started = lambda: control.start(
-        partial(http, config=config, server_state=server.server_state, app_state=server.lifespan.state)
+    for other in DATA_PARTS:
+        if other != part:
+            shared.counters.clear_gauges(other)
+    app = DataApp(control.learners, meters, shared, routes)
+    made: Any = guarded(
+        settings, kind=DataProtocol, others=control.passed, passed=control.passed, control=control.pass_on
     )
-    server.run([listener])
+    config = configure_server(
+        with_middleware(app, settings, keyring, meters, shared),
+        settings,
+        http=made,
+        ws=type("DataStream", (DataStream,), {"control": control.pass_on}),
+        port=0,  # uvicorn then logs the port that the system has chosen
+        lifespan="off",
+        timeout_graceful_shutdown=DRAIN_S,
+    )
+    server = DataServer(config, inherited.unix, settings.stop_notice_s, inherited.pulse)
+    server.when_started = lambda: control.start(
+        partial(made, config=config, server_state=server.server_state, app_state=server.lifespan.state)
+    )
+    if routes:
+        from service.planes.calls import serving_calls  # noqa: PLC0415 - of an extra, and only after the fork
+
+        server.calls = serving_calls(app, settings, keyring, meters, shared, server.stopping)
+    server.run([inherited.port])
+
+
+def _log(granted: RealTime) -> None:
+    """Log what the system grants, and how it would grant more."""
+    pages = "locked" if granted.pages_locked else "not locked"
+    policy = f"{granted.policy} {granted.priority}" if granted.priority else granted.policy
+    logger.info("control loops are answered by a thread of the scheduling policy %s; its pages are %s", policy, pages)
+    for refusal in granted.refusals:
+        logger.info("%s: %s", refusal.reason, refusal.remedy)
+
+
+def _routes_of_calls(settings: Settings) -> list[BaseRoute]:
+    """Return the routes of gRPC calls, if there are any."""
+    if settings.grpc_port is None:
+        return []
+    from service.api.oip.rpc.methods import Methods  # noqa: PLC0415 - of an extra
+
+    return [Methods()]
 
 
 class DataServer(sockets.Server):
-    """uvicorn's server on listeners that the supervisor has opened, with a heartbeat."""
+    """uvicorn's server on listeners that the supervisor has opened, with a heartbeat.
 
+    calls: serves gRPC. when_started: called once it listens.
+    """
+
+    calls: AbstractAsyncContextManager[None] = nullcontext()
     when_started: Callable[[], None]
 
     def __init__(self, config: uvicorn.Config, unix: UnixSocket | None, notice_s: float, pulse: Pulse) -> None:
@@ -79,6 +117,7 @@ class DataServer(sockets.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to answer."""
+        await self.calls.__aenter__()
         await super().startup(sockets)
         self.when_started()
         if self._pulse.last_beat(Plane.DATA).pid:
@@ -86,12 +125,15 @@ class DataServer(sockets.Server):
         else:
             self._log_started_message(sockets or ())
         self._loop = asyncio.get_running_loop()
+        gc.freeze()
+        _log(enter_real_time())
         self._beat()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Stop; the file of the Unix-domain socket stays for the next data plane."""
         self.unix = None
         await super().shutdown(sockets)
+        await self.calls.__aexit__(None, None, None)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Stop. A second signal changes nothing: the supervisor kills this process."""

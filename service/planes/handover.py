@@ -24,8 +24,14 @@ MAX_QUERY_BYTES = 16 * 1024
 """Max size of a request that the data plane answers, with its headers."""
 PART, OTHER = 0, -1
 """Results of `find_query`: the rest of the query is missing; there is no query."""
-_STARTS = (b"POST /v1/models/", b"POST /v1/echo ", b"GET /v1/models/", b"GET /v1/echo/stream", b"GET /health/live ")
-_QUERY = re.compile(rb"(?:POST /v1/(?:models/[^/ ?]+/predict|echo)|GET /health/live) HTTP/1\.1\r\n")
+_STARTS = (
+    *(b"POST /v1/models/", b"POST /v1/echo ", b"POST /v2/models/"),
+    *(b"GET /v1/models/", b"GET /v1/echo/stream", b"GET /health/live "),
+)
+_QUERY = re.compile(
+    rb"(?:POST /v1/(?:models/[^/ ?]+/predict|echo)|POST /v2/models/[^/ ?]+(?:/versions/[^/ ?]+)?/infer|"
+    rb"GET /health/live) HTTP/1\.1\r\n"
+)
 _STREAM = re.compile(rb"GET /v1/(?:models/[^/ ?]+|echo)/stream(?:\?[^ ]*)? HTTP/1\.1\r\n")
 _HEADERS = re.compile(rb"(?:[!-9;-~]+:[^\x00-\x08\x0a-\x1f\x7f]*\r\n)*\r\n")
 _LENGTH = re.compile(rb"\r\ncontent-length:([^\r]*)", re.IGNORECASE)
