@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from service.api.limits.requests import COUNTED, HEALTH
@@ -61,7 +62,8 @@ class DataProtocol(GuardedProtocol):
         if self._handed is not None:
             if self._handed.refused:
                 self.refuse_requests(self._handed.refused)
-            self._read(self._handed.read)
+            data, self._handed = self._handed.read, None  # frees memory
+            self._read(data)
 
     def data_received(self, data: bytes) -> None:
         """Handle bytes from the socket; those that come during an answer wait."""
@@ -206,7 +208,8 @@ class ControlProtocol(GuardedProtocol):
         super().connection_made(transport)
         if self._handed.refused:
             self.refuse_requests(self._handed.refused)
-        super().data_received(self._handed.read)
+        data, self._handed = self._handed.read, replace(self._handed, data=b"")  # frees memory
+        super().data_received(data)
 
     def data_received(self, data: bytes) -> None:
         """Handle bytes from the socket; pass the connection back at the start of a query."""

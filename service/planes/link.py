@@ -51,6 +51,11 @@ class ControlLink:
         self._protocol = protocol
         self._loop = asyncio.get_running_loop()
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a control plane."""
+        return self._channel is not None
+
     def close(self) -> None:
         """Close the channel for good."""
         self._closed = True
