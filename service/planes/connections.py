@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -17,7 +18,8 @@ CONNECTION = "lipserve.http_connection"
 """Key of the connection in the ASGI scope of a request that the data plane may hand over."""
 _REQUEST = "lipserve.stream_request"
 """Key of the bytes of a stream's request, and its client as in `LimitedConnection`, in the state of its connection."""
-_HEALTH_REQUESTS = (f"GET {HEALTH}".encode(), f"HEAD {HEALTH}".encode())
+_HEALTH_REQUEST = re.compile(rb"[A-Z]+ " + HEALTH.encode())
+"""The start of a request that is answered on connections beyond the limit, too."""
 
 
 class DataProtocol(GuardedProtocol):
@@ -85,7 +87,7 @@ class DataProtocol(GuardedProtocol):
             self._part = data
             self._unset_keepalive_if_required()
             self._watch_head()
-        elif size == OTHER and self.refused and not data.startswith(_HEALTH_REQUESTS):
+        elif size == OTHER and self.refused and not _HEALTH_REQUEST.match(data):
             super().data_received(data)
         elif size == OTHER:
             self._query = data
