@@ -6,8 +6,9 @@ Two services run, one with LIPSERVE_DATA_PLANE=on and one without. In turns, eac
 stream of torques and a stream of echoes send a frame every millisecond. The threads of these clients have SCHED_FIFO
 where that is permitted. --spin: processes that only compute, beside everything else.
 
-A late answer delays the frames after it, and their latency counts from when they were due: nothing is left out. An
-answer is wrong if it is an error, or has another sequence or another torque than the first one.
+A late answer delays the frames after it, and their latency counts from when they were due. Those that a slow service
+has not reached at the end of the window count with their wait until then: nothing is left out. An answer is wrong if it
+is an error, or has another sequence or another torque than the first one.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ from lipserve.frames import ANSWER, ERROR, REQUEST
 FRAME = np.array([[0.1, -0.1, 0.0, -1.8, 0.2, 1.6, 0.3], np.zeros(7), np.zeros(7)])
 SPIN_S = 50e-6
 """The client sleeps until this time before a frame is due, then it polls the clock."""
-WARM_UP_S = 1.0
+WARM_UP_S, END_S = 1.0, 5.0
+"""Start of a window that is not counted, and max wait for the end of the loads, s."""
 SHARES = (50, 99, 99.9, 99.99, 100)
 
 
@@ -63,7 +65,7 @@ def run_loop(
     due = time.perf_counter() + 0.05
     end = due + seconds + WARM_UP_S
     sequence, last = 0, 0.0
-    while due < end:
+    while due < end and last < end:
         now, behind = time.perf_counter(), last > due
         while now < due:
             if due - now > 2 * SPIN_S:
@@ -81,6 +83,8 @@ def run_loop(
             first = first or answer[ANSWER.size :]
             wrong += number != sequence or bool(flags & ERROR) or answer[ANSWER.size :] != first
         due += 1 / rate
+    missed = np.arange(due, end, 1 / rate)  # the service fell behind
+    latencies += (last - missed).tolist()
     out.put(Measured(np.array(latencies[int(rate * WARM_UP_S) :]), wrong, real_time))
 
 
@@ -95,8 +99,9 @@ def loaded(bed: Bed, names: list[str]) -> Iterator[None]:
         yield
     finally:
         ending.set()
+        deadline = time.monotonic() + END_S
         for process in processes:
-            process.join(TIMEOUT)
+            process.join(max(0.0, deadline - time.monotonic()))
             if process.is_alive():
                 process.kill()
 
@@ -122,7 +127,7 @@ def measure(bed: Bed, names: list[str], rate: float, seconds: float) -> dict[str
         ]
         for each in loops:
             each.start()
-        return {what: results.get(timeout=20 * seconds + TIMEOUT) for what, results in out.items()}
+        return {what: results.get(timeout=seconds + TIMEOUT) for what, results in out.items()}
 
 
 def report(name: str, what: str, windows: list[Measured]) -> None:
