@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import gc
 import logging
 import os
 import socket
@@ -32,6 +33,7 @@ from service.planes.link import ControlLink
 from service.planes.pulse import BEAT_S, Plane, Pulse
 from service.runtime import forking
 from service.runtime.process import SERVING_THREADS
+from service.runtime.realtime import RealTime, enter_real_time
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import StopState
 
@@ -82,6 +84,15 @@ def run(inherited: Inheritance, part: int) -> None:
     server.run([inherited.port])
 
 
+def _log(granted: RealTime) -> None:
+    """Log what the system grants, and how it would grant more."""
+    pages = "locked" if granted.pages_locked else "not locked"
+    policy = f"{granted.policy} {granted.priority}" if granted.priority else granted.policy
+    logger.info("control loops are answered by a thread of the scheduling policy %s; its pages are %s", policy, pages)
+    for refusal in granted.refusals:
+        logger.info("%s: %s", refusal.reason, refusal.remedy)
+
+
 def _routes_of_calls(settings: Settings) -> list[BaseRoute]:
     """Return the routes of gRPC calls, if there are any."""
     if settings.grpc_port is None:
@@ -115,6 +126,8 @@ class DataServer(sockets.Server):
         else:
             self._log_started_message(sockets or ())
         self._loop = asyncio.get_running_loop()
+        gc.freeze()
+        _log(enter_real_time())
         self._beat()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

@@ -20,6 +20,7 @@ from service.planes.counting import ConnectionReport, ConnectionShed, PassedConn
 from service.planes.frames import FramesLogged, RemoteLearners
 from service.planes.handover import Handed, adopt, pass_on
 from service.planes.published import PublishedModels
+from service.runtime.realtime import PRIORITY, enter_real_time
 
 logger = logging.getLogger(__name__)
 RECONNECT_S = 0.05
@@ -79,6 +80,8 @@ class ControlLink:
         return channel is not None and channel.send(message, fds, wait)
 
     def _run(self) -> None:
+        # the event loop waits for this thread when it needs Python's lock: other processes must not interrupt it
+        enter_real_time(PRIORITY - 1, lock_pages=False)
         while not self._closed:
             try:
                 self._channel = channel = Channel.connect(self._path)

@@ -76,6 +76,10 @@ class Server:
         """Return process ids of all of training, learning, and the one that estimates payloads."""
         return [pid for pid in descendants(self.process.pid) if "spawn_main" in command(pid) or name(pid) in COMPANIONS]
 
+    def named(self, wanted: str) -> list[int]:
+        """Return process ids of the processes with a name, such as `lip-data`."""
+        return [pid for pid in descendants(self.process.pid) if name(pid) == wanted]
+
     def kill(self) -> None:
         """Kill it as a power cut would, with its children."""
         self.process.send_signal(signal.SIGKILL)

@@ -30,9 +30,10 @@ def work(pulse: Pulse, plane: Plane) -> None:
         sys.exit(EXIT_CODE)
     while KIND == "failing" and not ended:
         time.sleep(0.01)
+    pulse.beat(plane)
     say(name, os.getpid())
     while not ended or KIND == "quiet":
-        if KIND != "quiet" or pulse.last_beat(plane).pid == 0:
+        if KIND != "quiet":
             pulse.beat(plane)
         time.sleep(0.01)
     say(name, "ended")

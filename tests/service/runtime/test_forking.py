@@ -4,12 +4,14 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from service.foundation.errors import NotFoundError
 from service.runtime import forking
+from service.telemetry.logs import new_request_id
 from tests.service.data import DEADLINE, eventually
 from tests.service.runtime import nurses
 from tests.service.server import is_running
@@ -86,3 +88,17 @@ def test_processes_end_with_their_nursery_and_it_ends_with_its_parent():
         _, forks, forked = map(int, process.stdout.readline().split())
         process.kill()
         eventually(lambda: not is_running(forks) and not is_running(forked))
+
+
+def test_forked_processes_have_request_ids_of_their_own():
+    def send_id(pipe):
+        os.write(pipe, new_request_id().encode())
+
+    reading, writing = os.pipe()
+    ids = {new_request_id()}
+    for _ in range(2):
+        os.waitpid(forking.fork(partial(send_id, writing), "test"), 0)
+        ids.add(os.read(reading, 100).decode())
+    os.close(reading)
+    os.close(writing)
+    assert len({each.partition("-")[0] for each in ids}) == 3
