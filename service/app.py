@@ -244,5 +244,5 @@ def _share(
         JobMetrics(storage.database),
         LearningCollector(learners),
         webhook,
-        System(storage, state.readiness),
+        System(storage, state.readiness, shared.counters),
     )

@@ -17,8 +17,10 @@ from prometheus_client.registry import Collector
 from service import __version__
 from service.api.access.scopes import READ, needs
 from service.api.route import Route
+from service.runtime import nursery
 from service.storage.disk import measure
 from service.storage.storage import Storage
+from service.telemetry.counters import Counters
 from service.telemetry.meters import Durations, Kind, Meters, MetricKind, merge_durations
 from service.telemetry.readiness import Readiness
 
@@ -36,17 +38,17 @@ class System(Collector):
     used = MetricKind("gauge", "lipserve_disk_used_bytes", "Size of the files in the home folder, by kind", ("what",))
     free = MetricKind("gauge", "lipserve_disk_free_bytes", "Free bytes on the disk of the home folder")
     memory = MetricKind(
-        "gauge", "lipserve_process_memory_bytes", "Resident memory of learner and training processes", ("process",)
+        "gauge", "lipserve_process_memory_bytes", "Resident memory of other processes of the service", ("process",)
     )
     cpu = MetricKind(
         "counter",
         "lipserve_process_cpu_seconds_total",
-        "CPU time of the running learner and training processes, s",
+        "CPU time of the running other processes of the service, s",
         ("process",),
     )
 
-    def __init__(self, storage: Storage, readiness: Readiness) -> None:
-        self._storage, self._readiness = storage, readiness
+    def __init__(self, storage: Storage, readiness: Readiness, counters: Counters) -> None:
+        self._storage, self._readiness, self._counters = storage, readiness, counters
         self._own = ProcessCollector(registry=None)
 
     def describe(self) -> list[Metric]:
@@ -64,20 +66,29 @@ class System(Collector):
         yield self.used.of(([what], size) for what, size in used.items())
         yield self.free.of([((), usage.free)])
         yield from self._own.collect()
-        yield from _processes()
+        yield from _processes(self._counters)
 
 
-def _processes() -> Iterator[Metric]:
-    """Yield memory and CPU time of the service's child processes, if the platform reports them."""
+def _processes(counters: Counters) -> Iterator[Metric]:
+    """Yield memory and CPU time of the other processes of a service, by kind, if the platform reports them."""
     kinds = {"process_resident_memory_bytes": System.memory, "process_cpu_seconds": System.cpu}
+    forks = nursery.current()
+    named = [*multiprocessing.active_children(), *(() if forks is None else forks.running())]
+    running = [(_kind_of(process.name), process.pid) for process in named]
+    running += [("data plane", pid) for pid in counters.others()]
     figures: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-    for process in multiprocessing.active_children():
-        name, pid = "learner" if process.name == "lipserve-learner" else "training", process.pid
+    for name, pid in running:
         for family in ProcessCollector(pid=lambda pid=pid: pid, registry=None).collect():  # type: ignore[misc]
             if family.name in kinds:
                 figures[family.name][name] += family.samples[0].value
     for metric, kind in kinds.items():
         yield kind.of(([name], value) for name, value in figures[metric].items())
+
+
+def _kind_of(process: str) -> str:
+    """Return the label of a process by its name."""
+    name = process.removeprefix("lipserve-")
+    return name if name in ("learner", "weigher") else "training"
 
 
 class Traffic(Collector):

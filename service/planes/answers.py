@@ -28,6 +28,7 @@ from service.foundation.errors import NotFoundError, NotReadyError, ServiceError
 from service.foundation.settings import Settings
 from service.planes.connections import CONNECTION, DataProtocol, DataStream
 from service.planes.frames import RemoteLearners
+from service.planes.tracing import traced
 from service.telemetry.meters import Meters
 
 logger = logging.getLogger(__name__)
@@ -150,10 +151,10 @@ def with_middleware(
     wrapped = LocalAccess(wrapped) if keyring is None else KeyAccess(wrapped, keyring)
     wrapped = Gate(wrapped, MAX_REQUESTS, shared.counters.gauge("admitted requests"))
     log = RequestLog([route.path for route in ROUTES], settings.log_slow_s, MAX_REFUSALS_PER_S)
-    wrapped = RequestContext(wrapped, meters, log)
+    wrapped = RequestContext(wrapped, meters, log, settings.opentelemetry)
 
     async def outermost(scope: Scope, receive: Receive, send: Send) -> None:
         scope["app"] = app  # middleware reads its state
         await wrapped(scope, receive, send)
 
-    return outermost
+    return traced(outermost, settings)

@@ -70,7 +70,7 @@ def run(inherited: Inheritance, part: int) -> None:
         http=made,
         ws=type("DataStream", (DataStream,), {"control": control.pass_on}),
         port=0,  # uvicorn then logs the port that the system has chosen
-        lifespan="off",
+        lifespan="on" if settings.opentelemetry else "off",
         timeout_graceful_shutdown=DRAIN_S,
     )
     server = DataServer(config, inherited.unix, settings.stop_notice_s, inherited.pulse)
@@ -97,7 +97,8 @@ def _routes_of_calls(settings: Settings) -> list[BaseRoute]:
     """Return the routes of gRPC calls, if there are any."""
     if settings.grpc_port is None:
         return []
-    from service.api.oip.rpc.methods import Methods  # noqa: PLC0415 - of an extra
+    import service.planes.calls  # noqa: F401, PLC0415 - of an extra; now, as it takes too long for a takeover
+    from service.api.oip.rpc.methods import Methods  # noqa: PLC0415
 
     return [Methods()]
 

@@ -6,6 +6,7 @@ import signal
 import sys
 from functools import partial
 
+from service.api.oip import rpc
 from service.foundation.settings import Settings
 from service.planes import control, data
 from service.planes.inheritance import DATA_PARTS, inheritance
@@ -20,7 +21,7 @@ from service.storage.storage import check_home
 def serve(settings: Settings) -> None:
     """Serve until a signal. Raise HomeError, SocketError or ThreadsError; exit with the code of a failed start."""
     forking.call(check_home, settings)
-    with inheritance(settings) as inherited:
+    with inheritance(rpc.choose_port(settings)) as inherited:
         limit_heaps()
         share_memory(settings)
         forking.check_threads()

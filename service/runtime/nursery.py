@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
+from weakref import WeakSet
 
 from threadpoolctl import threadpool_limits
 
@@ -32,8 +33,8 @@ class NurseryError(OSError):
 class Forked:
     """A process that the nursery has forked; used like `multiprocessing.Process`."""
 
-    def __init__(self, nursery: Nursery, pid: int, handle: int) -> None:
-        self.pid = pid
+    def __init__(self, nursery: Nursery, name: str, pid: int, handle: int) -> None:
+        self.name, self.pid = name, pid
         self._nursery, self._handle = nursery, handle
 
     def __del__(self) -> None:
@@ -64,7 +65,7 @@ class Nursery:
     def __init__(self) -> None:
         self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._ours.settimeout(REPLY_S)
-        self._lock, self._codes = threading.Lock(), dict[int, int]()
+        self._lock, self._codes, self._forked = threading.Lock(), dict[int, int](), WeakSet[Forked]()
 
         def work() -> None:
             self._ours.close()
@@ -84,7 +85,14 @@ class Nursery:
                 pid, handles = self._receive()
                 if handles:
                     self._codes.pop(pid, None)  # of an earlier process with the same id
-                    return Forked(self, pid, handles[0])
+                    forked = Forked(self, name, pid, handles[0])
+                    self._forked.add(forked)
+                    return forked
+
+    def running(self) -> list[Forked]:
+        """Return the processes that run."""
+        with self._lock:
+            return [each for each in self._forked if each.is_alive()]
 
     def exit_code(self, pid: int) -> int | None:
         """Return the exit code of an ended process."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import mmap
+import os
 from collections import defaultdict
 from collections.abc import Mapping, MutableSequence, Sequence
 from struct import Struct
@@ -22,7 +23,7 @@ RECORD_BYTES = NAME_BYTES + _NUMBER * (COUNTS + REALS)
 MAX_TALLIES = 8000
 """Tallies of one process. Further ones are of this process alone, and are lost when it ends."""
 HEADER_BYTES = 512
-"""Of a part: the number of its tallies, then its gauges."""
+"""Of a part: the number of its tallies, its process, then its gauges."""
 PART_BYTES = HEADER_BYTES + MAX_TALLIES * RECORD_BYTES
 _LENGTH = Struct("<H")
 _SEPARATOR = "\x1f"
@@ -95,6 +96,7 @@ class Counters:
         self._lock = Lock()
         self._gauges = {name: self._gauge(place) for place, name in enumerate(self.GAUGES)}
         if self._own is not None:
+            self._own.enter()
             self.clear_gauges(part)  # of a process that was killed
 
     def tally(self, *name: str) -> Tally:
@@ -126,6 +128,10 @@ class Counters:
         """Set the gauges of a part to zero, whose process has ended."""
         self._parts[part].clear_gauges(len(self.GAUGES))
 
+    def others(self) -> list[int]:
+        """Return the ids of the other processes; some of them may have ended."""
+        return [part.pid for part in self._parts if part is not self._own and part.pid]
+
     def _gauge(self, place: int) -> Gauge:
         if self._own is None:
             return new_gauge()
@@ -141,14 +147,23 @@ class _Part:
         self._tallies: dict[str, dict[Name, Tally]] = defaultdict(dict)  # by kind: those read so far
         self._read, self._lock = 0, Lock()
 
+    @property
+    def pid(self) -> int:
+        """The process that writes the part, or has written it last; 0 if there was none."""
+        return self._header[1]
+
+    def enter(self) -> None:
+        """Note that this process writes the part."""
+        self._header[1] = os.getpid()
+
     def gauge(self, place: int) -> memoryview:
         """Return the number of a gauge."""
-        return self._header[1 + place : 2 + place]
+        return self._header[2 + place : 3 + place]
 
     def clear_gauges(self, number: int) -> None:
         """Set all gauges to zero."""
         for place in range(number):
-            self._header[1 + place] = 0
+            self._header[2 + place] = 0
 
     def tallies(self, kind: str) -> dict[Name, Tally]:
         """Return the tallies of a kind."""

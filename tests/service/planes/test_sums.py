@@ -150,6 +150,14 @@ def test_metrics_are_sums_of_both_planes_and_outlive_them(service):
     assert samples(service, "lipserve_streams_open") == {(): 0}
 
 
+def test_memory_of_each_process_is_shown(service):
+    def shown() -> set[str]:
+        return {process for (process,) in samples(service, "lipserve_process_memory_bytes")}
+
+    eventually(lambda: {"data plane", "weigher"} <= shown())
+    assert samples(service, "lipserve_process_cpu_seconds_total")["data plane",] > 0
+
+
 @pytest.mark.slow
 def test_streams_of_a_killed_plane_free_their_places(tmp_path):
     with two_planes(tmp_path / "home", LIPSERVE_MAX_STREAMS="3") as server:

@@ -94,3 +94,14 @@ def test_threads_of_a_process_get_the_same_tally():
     for thread in threads:
         thread.join()
     assert len({id(tally) for tally in found}) == len(ours.tallies("kind")) == 200
+
+
+def test_other_processes_are_known():
+    memory = CounterMemory(3)
+    ours = Counters(memory, 0)
+    in_child(lambda: Counters(memory, 1))
+    assert [pid for pid in ours.others() if pid != os.getpid()] == ours.others()
+    assert len(ours.others()) == 1
+    Counters(memory, 2)
+    assert os.getpid() in ours.others()
+    assert Counters().others() == []
