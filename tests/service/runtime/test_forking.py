@@ -58,6 +58,8 @@ def test_called_function_runs_elsewhere_and_its_error_comes_back():
 
     with pytest.raises(NotFoundError, match="gone"):
         forking.call(fail)
+    with pytest.raises(ChildProcessError, match="exit code -9"):
+        forking.call(lambda: os.kill(os.getpid(), signal.SIGKILL))
 
 
 def test_process_with_threads_is_told_what_to_do():
