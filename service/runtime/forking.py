@@ -111,9 +111,12 @@ def adopt_orphans() -> None:
 
 
 def kill_orphans(kept: Container[int | None]) -> bool:
-    """Kill the children of this process and its group, but some; return whether there were any."""
-    group = os.getpgrp()
-    orphans = [pid for pid in children() if pid not in kept and _group(pid) == group]
+    """Kill the children of this process and its group, but some; return whether there were any.
+
+    A container's first process also adopts processes that others have started in the container, in other groups.
+    """
+    group = os.getpgrp()  # 0: a group from outside the container
+    orphans = [pid for pid in children() if pid not in kept and group and _group(pid) == group]
     for pid in orphans:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
