@@ -26,8 +26,9 @@ from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guar
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.models import registry
-from service.models.loaded import PRELOADED
+from service.models.loading import PRELOADED
 from service.planes import control, data, nursery
+from service.planes.confirmations import confirm_answers
 from service.runtime import companion
 from service.runtime.allocator import limit_free_memory
 from service.storage.database import Database
@@ -149,6 +150,7 @@ def _control(settings: Settings, link: socket.socket) -> None:
     nursery.start()
     companion.FORK = nursery.fork
     served = create_app(settings)
+    confirm_answers(served)
     config = uvicorn.Config(
         served,
         log_config=None,
