@@ -22,11 +22,11 @@ from service.api.access.scopes import Rules
 from service.api.dashboard import routes as dashboard
 from service.api.guide import routes as guide
 from service.api.head import HeadAsGet
-from service.api.limits.requests import MAX_REQUESTS, PATIENCE, BodyLimit, Gate, RateLimit, Turns, body_limits
+from service.api.limits.rates import RateLimit
+from service.api.limits.requests import MAX_REQUESTS, PATIENCE, BodyLimit, Gate, Turns, body_limits
 from service.api.metrics import System, Traffic
 from service.api.oip import extension_routes, rpc
 from service.api.oip import routes as oip
-from service.api.oip.sequences import Sequences
 from service.api.oip.statistics import Statistics
 from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
 from service.api.routes import (
@@ -41,6 +41,7 @@ from service.api.routes import (
     predictions,
     robots,
 )
+from service.api.shared import Shared
 from service.api.stream import routes as stream
 from service.foundation.settings import Settings
 from service.foundation.text import counted
@@ -71,12 +72,16 @@ Errors are `{"error": {code, message, detail}}`, below /v2 `{"error": message}` 
 """
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
-    """Return the application. It opens files and the database only when it starts."""
-    settings = settings or Settings()
-    stopping, meters = StopState(), Meters()
+def create_app(settings: Settings | None = None, shared: Shared | None = None) -> FastAPI:
+    """Return the application. It opens files and the database only when it starts.
+
+    shared: what it shares with other processes of the service; None if it is alone.
+    """
+    settings, shared = settings or Settings(), shared or Shared()
+    stopping, meters = StopState(), Meters(counters=shared.counters)
     calls = rpc.check_installed(settings)
-    keyring = Keyring(REFRESH_S, settings.max_request_burst) if settings.keys_needed else None
+    burst = settings.max_request_burst
+    keyring = Keyring(REFRESH_S, burst, shared.counters, shared.buckets) if settings.keys_needed else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -86,7 +91,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         limit_threads(SERVING_THREADS)
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
         webhook = Webhook(storage.database, settings)
-        _share(app, storage, jobs, learners, webhook)
+        _share(app, storage, jobs, learners, webhook, shared)
         stop_following = storage.database.follow_others(lambda: Replication(learners).close)
         try:
             async with AsyncExitStack() as serving:
@@ -94,7 +99,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                     await serving.enter_async_context(keyring.watching(storage.database))
                 await serving.enter_async_context(clean_hourly(storage.database, settings))
                 if calls:
-                    await serving.enter_async_context(_calls(app, settings, stopping))
+                    await serving.enter_async_context(_calls(app, settings, stopping, shared))
                 webhook.start()
                 yield
         finally:
@@ -124,7 +129,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.stopping, app.state.meters, app.state.confined = stopping, meters, protections()
     errors.install(app)
-    _add_middleware(app, settings, keyring, meters, hot)
+    _add_middleware(app, settings, keyring, meters, hot, shared)
     openapi.install(app, settings.keys_needed)
     for router in (
         health.router,
@@ -140,7 +145,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         live.router,
         extension_routes.router,  # before /v2/models/{model}
         oip.router,
-        stream.router(),
+        stream.router(shared.counters.gauge("admitted streams")),
     ):
         app.include_router(router)
     dashboard.install(app)
@@ -155,14 +160,19 @@ def _calls_route() -> BaseRoute:
     return Methods()
 
 
-def _calls(app: FastAPI, settings: Settings, stopping: StopState) -> AbstractAsyncContextManager[int]:
+def _calls(app: FastAPI, settings: Settings, stopping: StopState, shared: Shared) -> AbstractAsyncContextManager[int]:
     from service.api.oip.rpc.listening import listening  # noqa: PLC0415 - of an extra
 
-    return listening(app, settings, stopping)
+    return listening(app, settings, stopping, shared.calls)
 
 
 def _add_middleware(
-    app: FastAPI, settings: Settings, keyring: Keyring | None, meters: Meters, hot: list[BaseRoute]
+    app: FastAPI,
+    settings: Settings,
+    keyring: Keyring | None,
+    meters: Meters,
+    hot: list[BaseRoute],
+    shared: Shared,
 ) -> None:
     """Add the middleware of all requests, from the inside out."""
     app.add_middleware(HeadAsGet)
@@ -174,12 +184,14 @@ def _add_middleware(
         at_once=MAX_REQUESTS // 4,
     )
     if settings.max_requests_per_s is not None:
-        app.add_middleware(RateLimit, per_s=settings.max_requests_per_s, burst=settings.max_request_burst)
+        app.add_middleware(
+            RateLimit, per_s=settings.max_requests_per_s, burst=settings.max_request_burst, buckets=shared.buckets
+        )
     if keyring is None:
         app.add_middleware(LocalAccess)
     else:
         app.add_middleware(KeyAccess, keyring=keyring)
-    app.add_middleware(Gate, max_requests=MAX_REQUESTS)
+    app.add_middleware(Gate, max_requests=MAX_REQUESTS, admitted=shared.counters.gauge("admitted requests"))
     quiet = (str(getattr(route, "path", "")) for route in hot)
     log = RequestLog(quiet, settings.log_slow_s, MAX_REFUSALS_PER_S)
     app.add_middleware(RequestContext, meters=meters, log=log, tracing=settings.opentelemetry)  # the outermost
@@ -212,7 +224,9 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     return storage, jobs, learners
 
 
-def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners, webhook: Webhook) -> None:
+def _share(
+    app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners, webhook: Webhook, shared: Shared
+) -> None:
     """Store the parts in the application's state, where routes read them."""
     state, loaded, settings = app.state, learners.loaded, storage.settings
     probes: dict[str, Probe] = {
@@ -222,7 +236,7 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners, w
         "training": lambda lasting: check_queue(jobs, lasting),
     }
     state.storage, state.loaded, state.jobs, state.learners = storage, loaded, jobs, learners
-    state.sequences, state.statistics = Sequences(), Statistics()
+    state.sequences, state.statistics = shared.sequences, Statistics(shared.counters)
     state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))
     state.readiness = Readiness(probes, state.stopping)
     state.collectors = (
@@ -230,5 +244,5 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners, w
         JobMetrics(storage.database),
         LearningCollector(learners),
         webhook,
-        System(storage, state.readiness),
+        System(storage, state.readiness, shared.counters),
     )

@@ -57,7 +57,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(ServiceError, _service_error)
     app.add_exception_handler(MissingExtraError, _missing_extra)
     app.add_exception_handler(RequestValidationError, _validation_error)
-    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(HTTPException, http_error)
     app.add_exception_handler(ClientDisconnect, _cut_off)
     for kind in (DBAPIError, PoolTimeoutError, OSError):
         app.add_exception_handler(kind, _storage_error)
@@ -125,7 +125,8 @@ async def _cut_off(request: Request, error: Exception) -> JSONResponse:
     return answer_of(request.scope, invalid_request("body", "incomplete", "the whole body"))
 
 
-async def _http_error(request: Request, error: Exception) -> JSONResponse:
+async def http_error(request: Request, error: Exception) -> JSONResponse:
+    """Answer an error of a framework or of a middleware, in the service's words."""
     assert isinstance(error, HTTPException)
     codes = {404: "not_found", 405: "method_not_allowed", 408: "request_timeout", 413: "too_large", 429: "busy"}
     message = str(error.detail)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import PlainTextResponse
@@ -17,8 +17,10 @@ from prometheus_client.registry import Collector
 from service import __version__
 from service.api.access.scopes import READ, needs
 from service.api.route import Route
+from service.runtime import nursery
 from service.storage.disk import measure
 from service.storage.storage import Storage
+from service.telemetry.counters import Counters
 from service.telemetry.meters import Durations, Kind, Meters, MetricKind, merge_durations
 from service.telemetry.readiness import Readiness
 
@@ -36,17 +38,17 @@ class System(Collector):
     used = MetricKind("gauge", "lipserve_disk_used_bytes", "Size of the files in the home folder, by kind", ("what",))
     free = MetricKind("gauge", "lipserve_disk_free_bytes", "Free bytes on the disk of the home folder")
     memory = MetricKind(
-        "gauge", "lipserve_process_memory_bytes", "Resident memory of learner and training processes", ("process",)
+        "gauge", "lipserve_process_memory_bytes", "Resident memory of other processes of the service", ("process",)
     )
     cpu = MetricKind(
         "counter",
         "lipserve_process_cpu_seconds_total",
-        "CPU time of the running learner and training processes, s",
+        "CPU time of the running other processes of the service, s",
         ("process",),
     )
 
-    def __init__(self, storage: Storage, readiness: Readiness) -> None:
-        self._storage, self._readiness = storage, readiness
+    def __init__(self, storage: Storage, readiness: Readiness, counters: Counters) -> None:
+        self._storage, self._readiness, self._counters = storage, readiness, counters
         self._own = ProcessCollector(registry=None)
 
     def describe(self) -> list[Metric]:
@@ -64,20 +66,29 @@ class System(Collector):
         yield self.used.of(([what], size) for what, size in used.items())
         yield self.free.of([((), usage.free)])
         yield from self._own.collect()
-        yield from _processes()
+        yield from _processes(self._counters)
 
 
-def _processes() -> Iterator[Metric]:
-    """Yield memory and CPU time of the service's child processes, if the platform reports them."""
+def _processes(counters: Counters) -> Iterator[Metric]:
+    """Yield memory and CPU time of the other processes of a service, by kind, if the platform reports them."""
     kinds = {"process_resident_memory_bytes": System.memory, "process_cpu_seconds": System.cpu}
+    forks = nursery.current()
+    named = [*multiprocessing.active_children(), *(() if forks is None else forks.running())]
+    running = [(_kind_of(process.name), process.pid) for process in named]
+    running += [("data plane", pid) for pid in counters.others()]
     figures: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
-    for process in multiprocessing.active_children():
-        name, pid = "learner" if process.name == "lipserve-learner" else "training", process.pid
+    for name, pid in running:
         for family in ProcessCollector(pid=lambda pid=pid: pid, registry=None).collect():  # type: ignore[misc]
             if family.name in kinds:
                 figures[family.name][name] += family.samples[0].value
     for metric, kind in kinds.items():
         yield kind.of(([name], value) for name, value in figures[metric].items())
+
+
+def _kind_of(process: str) -> str:
+    """Return the label of a process by its name."""
+    name = process.removeprefix("lipserve-")
+    return name if name in ("learner", "weigher") else "training"
 
 
 class Traffic(Collector):
@@ -129,24 +140,24 @@ class Traffic(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
         requests, streams = self._meters.requests, self._meters.streams()
-        seen = {Kind(*key): durations for key, durations in list(requests.known.items())}
+        seen = requests.totals()
         yield self.duration.spread(_grouped(seen, lambda kind: (kind.method, kind.route, kind.model)))
         answers = _grouped(seen, lambda kind: (kind.method, kind.route, str(kind.status)))
         yield self.requests.of((labels, sum(each.counts)) for labels, each in answers)
         refused = {kind: durations for kind, durations in seen.items() if kind.code}
         errors = _grouped(refused, lambda kind: (kind.route, kind.code))
         yield self.errors.of((labels, sum(each.counts)) for labels, each in errors)
-        yield self.in_flight.of([((), requests.in_flight)])
-        yield self.streams.of([((), requests.streams)])
+        yield self.in_flight.of([((), requests.in_flight.total)])
+        yield self.streams.of([((), requests.streams.total)])
         yield self.frames.spread(([model], meter.durations) for model, meter in streams.items())
         yield self.late.of(([model], meter.late) for model, meter in streams.items())
         yield self.frame_errors.of(
-            ([model, code], count) for model, meter in streams.items() for code, count in dict(meter.refused).items()
+            ([model, code], count) for model, meter in streams.items() for code, count in meter.refused.items()
         )
 
 
 def _grouped(
-    seen: dict[Kind, Durations], labels: Callable[[Kind], tuple[str, ...]]
+    seen: Mapping[Kind, Durations], labels: Callable[[Kind], tuple[str, ...]]
 ) -> list[tuple[tuple[str, ...], Durations]]:
     groups: dict[tuple[str, ...], list[Durations]] = defaultdict(list)
     for kind, durations in seen.items():

@@ -159,19 +159,19 @@ class RequestContext:
                 status, answered = begun, perf_counter()
                 message["headers"] = [*message.get("headers", ()), (REQUEST_ID, name.encode())]
                 if begun == 101:
-                    self.requests.streams += 1
+                    self.requests.streams.add(1)
                     self.log.log_open(scope, _template(scope))
             return send(message)
 
-        self.requests.in_flight += method is not WEBSOCKET
+        self.requests.in_flight.add(method is not WEBSOCKET)
         try:
             await self.app(scope, receive, note_status)
         except Exception as error:
             await self._answer(scope, receive, note_status, error, begun=bool(status))
             raise
         finally:
-            self.requests.in_flight -= method is not WEBSOCKET
-            self.requests.streams -= status == 101
+            self.requests.in_flight.add(-(method is not WEBSOCKET))
+            self.requests.streams.add(-(status == 101))
             now = perf_counter()
             if HANDED_OVER not in scope:
                 self._count(scope, method, status or 499, began, answered if status else now, now)

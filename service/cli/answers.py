@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -17,6 +17,10 @@ from service.cli.consoles import CommandError, out, print_json, print_warnings
 from service.cli.options import Data, Json, ModelVersion, Url, alone, group, names, numbers
 from service.cli.versions import print_verdict
 from service.foundation.text import counted
+
+if TYPE_CHECKING:
+    from lipcore.data.samples import Array
+    from lipserve import Client
 
 predict_app = alone()
 
@@ -150,12 +154,7 @@ def latency(
     import numpy as np  # noqa: PLC0415 - slow import, not needed for help
 
     with connected(url) as client:
-        served = client.model(model)
-        version = client.version(model, served.serving_version or served.latest_version)
-        low, high = (
-            np.array([version.training_range[name][side] for name in ("q", "dq", "ddq")]) for side in ("min", "max")
-        )
-        motions = np.random.default_rng(0).uniform(low, high, (queries + WARM_UP, *low.shape))
+        version, motions = random_motions(client, model, queries + WARM_UP)
         with client.stream(model) as stream:
             times = {"stream": _timed(lambda k: stream.predict(*motions[k]), queries)}
         times["HTTP"] = _timed(lambda k: client.predict(model, *motions[k]), queries)
@@ -164,18 +163,30 @@ def latency(
         for name, each in times.items()
     }
     if as_json:
-        print_json({"model": model, "version": version.version, "queries": queries, "milliseconds": figures})
+        print_json({"model": model, "version": version, "queries": queries, "milliseconds": figures})
         return
     table = Table(
         "ms per query",
         "p50",
         "p99",
         "largest",
-        title=f"{model} version {version.version}, {counted(queries, 'query', 'queries')}",
+        title=f"{model} version {version}, {counted(queries, 'query', 'queries')}",
     )
     for name, each in figures.items():
         table.add_row(name, *(f"{value:.2f}" for value in each.values()))
     out.print(table)
+
+
+def random_motions(client: Client, model: str, count: int) -> tuple[int, Array]:
+    """Return the serving version, and motions (count, 3, n) within its training range: q, dq and ddq."""
+    import numpy as np  # noqa: PLC0415 - as above
+
+    served = client.model(model)
+    version = client.version(model, served.serving_version or served.latest_version)
+    low, high = (
+        np.array([version.training_range[name][side] for name in ("q", "dq", "ddq")]) for side in ("min", "max")
+    )
+    return version.version, np.random.default_rng(0).uniform(low, high, (count, *low.shape))
 
 
 def _timed(ask: Callable[[int], object], queries: int) -> list[float]:

@@ -88,6 +88,9 @@ class Commands(LazyGroup):
         "worker": Entry("service.cli.worker", "Run training jobs for services that share a Dask cluster.", RUN),
         "settings": Entry("service.cli.settings", "List all settings with values, defaults and units.", RUN),
         "status": Entry("service.cli.status", "Show whether a service is ready, and its missing extras.", RUN),
+        "doctor": Entry(
+            "service.cli.doctor.command", "Show what this machine permits, and measure its loop rate.", RUN
+        ),
         "open": Entry("service.cli.open", "Print the address of the dashboard.", RUN),
         "demo": Entry("service.cli.demo", "Run a two-minute demo: simulate a Panda, train, evaluate, predict.", RUN),
         "keys": Entry("service.cli.keys", "Create, list and revoke API keys of the home LIPSERVE_HOME.", RUN),

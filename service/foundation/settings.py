@@ -128,7 +128,7 @@ class Settings(BaseSettings):
         0.25, description="Min duration of a query of a control loop for which it is logged as slow."
     )
     data_plane: bool = Field(
-        False,
+        True,
         description="Answer control loops in a process of their own, which other requests cannot delay. Linux only.",
     )
     opentelemetry: bool = Field(

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from starlette.datastructures import State
-from starlette.routing import compile_path
+from starlette.routing import BaseRoute, compile_path
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.api.access.keys import Keyring
 from service.api.access.middleware import KeyAccess, LocalAccess
 from service.api.access.scopes import Rules
 from service.api.errors import refuse, unexpected_error
-from service.api.limits.requests import MAX_REQUESTS, Gate, RateLimit
+from service.api.limits.rates import RateLimit
+from service.api.limits.requests import MAX_REQUESTS, Gate
+from service.api.oip import routes as oip
+from service.api.oip.statistics import Statistics
 from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
 from service.api.route import Answerer
 from service.api.routes import health, predictions
 from service.api.server.connections import CONNECTION as STREAM
+from service.api.shared import Shared
 from service.api.stream import routes as stream
 from service.foundation.errors import NotFoundError, NotReadyError, ServiceError
 from service.foundation.settings import Settings
 from service.planes.connections import CONNECTION, DataProtocol, DataStream
 from service.planes.frames import RemoteLearners
+from service.planes.tracing import traced
 from service.telemetry.meters import Meters
 
 logger = logging.getLogger(__name__)
@@ -39,6 +44,8 @@ class QueryRoute(NamedTuple):
 ROUTES = (
     QueryRoute("/v1/models/{model}/predict", predictions.answer_at_once),
     QueryRoute("/v1/echo", predictions.answer_echo),
+    QueryRoute("/v2/models/{model}/infer", oip.answer_at_once),
+    QueryRoute("/v2/models/{model}/versions/{version}/infer", oip.answer_at_once),
     QueryRoute("/health/live", health.answer_live),
 )
 
@@ -64,16 +71,21 @@ class Paths(Generic[Found]):
 class DataApp:
     """The application of the data plane. It hands over what it cannot answer, errors included.
 
-    state: what routes and middleware read, as in the state of the control plane's application.
+    state: what routes and middleware read, as in the state of the control plane's application. further: routes whose
+    requests have an application of their own.
     """
 
     exception_handlers: ClassVar[dict[type[Exception], Any]] = {Exception: unexpected_error}
 
-    def __init__(self, learners: RemoteLearners, meters: Meters) -> None:
-        declared = [predictions.hot, predictions.echo_hot, health.router, stream.router()]
-        rules = Rules([route for each in declared for route in each.routes])
+    def __init__(
+        self, learners: RemoteLearners, meters: Meters, shared: Shared, further: Sequence[BaseRoute] = ()
+    ) -> None:
+        admitted = shared.counters.gauge("admitted streams")
+        declared = [predictions.hot, predictions.echo_hot, oip.hot, health.router, stream.router(admitted)]
+        rules = Rules([*(route for each in declared for route in each.routes), *further])
         self.state = State({"loaded": learners.loaded, "learners": learners, "meters": meters, "rules": rules})
-        counter = stream.Streams()
+        self.state.sequences, self.state.statistics = shared.sequences, Statistics(shared.counters)
+        counter = stream.Streams(admitted)
         self._queries = Paths({route.path: route for route in ROUTES})
         self._streams = Paths({stream.PATH: stream.StreamRoute(counter), stream.ECHO_PATH: stream.EchoRoute(counter)})
 
@@ -121,18 +133,28 @@ class DataApp:
             await refuse(error, scope, receive, send)
 
 
-def with_middleware(app: DataApp, settings: Settings, keyring: Keyring | None, meters: Meters) -> ASGIApp:
-    """Return the application below the middleware that queries pass in the control plane too."""
-    wrapped: ASGIApp = app
+def with_middleware(
+    app: DataApp,
+    settings: Settings,
+    keyring: Keyring | None,
+    meters: Meters,
+    shared: Shared,
+    inner: ASGIApp | None = None,
+) -> ASGIApp:
+    """Return the application below the middleware that queries pass in the control plane too.
+
+    inner: answers requests instead of the application, of which only the state is read.
+    """
+    wrapped: ASGIApp = app if inner is None else inner
     if settings.max_requests_per_s is not None:
-        wrapped = RateLimit(wrapped, settings.max_requests_per_s, settings.max_request_burst)
+        wrapped = RateLimit(wrapped, settings.max_requests_per_s, settings.max_request_burst, shared.buckets)
     wrapped = LocalAccess(wrapped) if keyring is None else KeyAccess(wrapped, keyring)
-    wrapped = Gate(wrapped, MAX_REQUESTS)
+    wrapped = Gate(wrapped, MAX_REQUESTS, shared.counters.gauge("admitted requests"))
     log = RequestLog([route.path for route in ROUTES], settings.log_slow_s, MAX_REFUSALS_PER_S)
-    wrapped = RequestContext(wrapped, meters, log)
+    wrapped = RequestContext(wrapped, meters, log, settings.opentelemetry)
 
     async def outermost(scope: Scope, receive: Receive, send: Send) -> None:
         scope["app"] = app  # middleware reads its state
         await wrapped(scope, receive, send)
 
-    return outermost
+    return traced(outermost, settings)

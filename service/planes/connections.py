@@ -7,7 +7,9 @@ from typing import Any, ClassVar
 
 from service.api.limits.requests import COUNTED, HEALTH
 from service.api.requests import HANDED_OVER
+from service.api.server.connection_limit import Excess
 from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.planes.counting import PassedConnections
 from service.planes.handover import OTHER, PART, Handed, PassOn, find_query, refuse_connection, shared
 
 CONNECTION = "lipserve.http_connection"
@@ -20,10 +22,11 @@ _HEALTH_REQUESTS = (f"GET {HEALTH}".encode(), f"HEAD {HEALTH}".encode())
 class DataProtocol(GuardedProtocol):
     """A connection in the data plane: it answers whole queries, and passes itself on at any other request.
 
-    control: passes connections to the control plane. handed: of a connection that came from there.
+    control: passes connections to the control plane. passed: counts them. handed: of a connection that came from there.
     """
 
     control: ClassVar[PassOn]
+    passed: ClassVar[PassedConnections]
 
     def __init__(self, *args: Any, handed: Handed | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -33,13 +36,24 @@ class DataProtocol(GuardedProtocol):
         self._later = b""  # what came during an answer
         self._whole = False
         self._leaving: bool | None = None  # to the control plane; whether the request was counted
+        self._deciding: asyncio.Task[None] | None = None  # whether this connection exceeds a limit
 
-    def admit(self) -> tuple[int, str]:
+    def admit(self) -> Excess:
         """Make room for this connection, unless it was admitted before."""
         if self._handed is None:
             return super().admit()
         self.limit.adopt(self)
-        return 0, ""
+        return Excess(0)
+
+    def exceed(self, excess: Excess) -> None:
+        """Wait until the control plane has closed an idle connection, or refuse requests."""
+        self._deciding = self.loop.create_task(self._decide(excess))
+
+    async def _decide(self, excess: Excess) -> None:
+        if not await self.passed.shed(excess.peer):
+            self.refuse_requests(excess.why)
+        self._deciding = None
+        self._read_later()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin, with the bytes that the control plane has read, if any."""
@@ -51,11 +65,16 @@ class DataProtocol(GuardedProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Handle bytes from the socket; those that come during an answer wait."""
-        if self._leaving is not None or (self.cycle is not None and not self.cycle.response_complete):
+        if self._is_busy():
             self._later += data
             self.transport.pause_reading()
         else:
             self._read(self._part + data)
+
+    def _is_busy(self) -> bool:
+        """Return whether further bytes must wait."""
+        answering = self.cycle is not None and not self.cycle.response_complete
+        return answering or self._leaving is not None or self._deciding is not None
 
     def _read(self, data: bytes) -> None:
         """Answer a query, collect the rest of one, or pass the connection on."""
@@ -101,7 +120,7 @@ class DataProtocol(GuardedProtocol):
             self.loop.call_soon(self._read_later)
 
     def _read_later(self) -> None:
-        if not self.transport.is_closing():
+        if self._later and not self.transport.is_closing():
             later, self._later = self._later, b""
             self.transport.resume_reading()
             self._read(later)
@@ -177,10 +196,10 @@ class ControlProtocol(GuardedProtocol):
         self._first = True
         self._between = False  # two requests: the parser has read the last one to its end
 
-    def admit(self) -> tuple[int, str]:
+    def admit(self) -> Excess:
         """Add this connection, which the data plane has admitted."""
         self.limit.adopt(self)
-        return 0, ""
+        return Excess(0)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin with the bytes that the data plane has read."""

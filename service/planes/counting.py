@@ -10,15 +10,14 @@ import asyncio
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from time import monotonic
 from typing import Any
 
 from service.api.server.connection_limit import ConnectionLimit
 
 REPORT_S = 0.1
 """Seconds between two reports, if the number of connections has changed."""
-BUSY_S = 1.0
-"""Seconds for which no connection is shed after the control plane had no idle one."""
+MAX_SHED_S = 0.2
+"""Max wait for the control plane to close a connection, s."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +34,16 @@ class ConnectionReport:
 class ShedConnection:
     """Asks the control plane to close an idle connection, of one client if given."""
 
+    number: int
     peer: str | None
 
 
 @dataclass(frozen=True)
-class NoneIdle:
-    """The answer of the control plane if it has no idle connection to close."""
+class ConnectionShed:
+    """The answer to `ShedConnection`: whether there was an idle connection."""
+
+    number: int
+    done: bool
 
 
 class PassedConnections:
@@ -52,7 +55,8 @@ class PassedConnections:
     def __init__(self, send: Callable[[Any], bool]) -> None:
         self._send = send
         self._passed, self._newest = deque[tuple[int, str | None]](), 0
-        self._report, self._total, self._busy_until = ConnectionReport(), 0, 0.0
+        self._report, self._total = ConnectionReport(), 0
+        self._shedding: dict[int, asyncio.Future[bool]] = {}
 
     def number(self, peer: str | None) -> int:
         """Count a connection that is passed on; return its number."""
@@ -74,6 +78,8 @@ class PassedConnections:
         """Forget all: the control plane has ended, and its connections with it."""
         self._passed.clear()
         self.update(ConnectionReport())
+        for number in self._shedding:
+            self.receive(ConnectionShed(number, done=True))
 
     def count(self, peer: str | None) -> int:
         """Return the number of connections of a client; None: of all."""
@@ -81,15 +87,25 @@ class PassedConnections:
             return self._total + len(self._passed)
         return self._report.counts.get(peer, 0) + sum(each == peer for _, each in self._passed)
 
-    def shed(self, peer: str | None) -> bool:
-        """Let the control plane close an idle connection; return False if it lately had none."""
-        if not self.count(peer) or monotonic() < self._busy_until:
+    async def shed(self, peer: str | None) -> bool:
+        """Let the control plane close an idle connection, of one client if given; return whether it has."""
+        if not self.count(peer):
             return False
-        return self._send(ShedConnection(peer))
+        self._newest = number = self._newest + 1
+        self._shedding[number] = done = asyncio.get_running_loop().create_future()
+        try:
+            if not self._send(ShedConnection(number, peer)):
+                return False
+            return await asyncio.wait_for(done, MAX_SHED_S)
+        except TimeoutError:
+            return False
+        finally:
+            del self._shedding[number]
 
-    def note_busy(self) -> None:
-        """Note that the control plane has no idle connection."""
-        self._busy_until = monotonic() + BUSY_S
+    def receive(self, answer: ConnectionShed) -> None:
+        """Pass the answer of the control plane to the connection that waits for it."""
+        if (done := self._shedding.get(answer.number)) is not None and not done.done():
+            done.set_result(answer.done)
 
 
 class AdoptedConnections:
@@ -116,9 +132,6 @@ class AdoptedConnections:
             self.sent = made
             self._send(made)
 
-    def shed(self, asked: ShedConnection) -> None:
-        """Close an idle connection, or reply that there is none."""
-        if self._limit.shed(asked.peer):
-            self.report_now()
-        else:
-            self._send(NoneIdle())
+    def shed(self, asked: ShedConnection) -> ConnectionShed:
+        """Close an idle connection if there is one."""
+        return ConnectionShed(asked.number, self._limit.shed(asked.peer))

@@ -49,6 +49,13 @@ class DataPlanes:
         self._loop.call_soon_threadsafe(self._join, channel)
         threading.Thread(target=self._receive, args=(channel,), daemon=True, name="data plane").start()
 
+    def close(self) -> None:
+        """Stop publishing and reporting, and close the channels."""
+        self._publisher.close()
+        self._reporting.cancel()
+        for channel in tuple(self._channels):
+            channel.close()
+
     def _receive(self, channel: Channel) -> None:
         while (received := channel.receive()) is not None:
             try:
@@ -76,7 +83,7 @@ class DataPlanes:
             case FramesToLog():
                 asyncio.run_coroutine_threadsafe(self._log(learners, channel, message), self._loop)
             case ShedConnection():
-                self._loop.call_soon_threadsafe(self._connections.shed, message)
+                self._loop.call_soon_threadsafe(self._shed, channel, message)
             case Holdings():
                 self._publisher.subscribe(channel, message)
             case Answering() | Confirmed() | LoadRequest() | VersionUse():
@@ -95,8 +102,11 @@ class DataPlanes:
             return False
         return pass_on(transport, handed, lambda fd, message: channel.send(message, [fd], wait=False))
 
+    def _shed(self, channel: Channel, asked: ShedConnection) -> None:
+        channel.send(self._connections.shed(asked), wait=False)
+
     def _broadcast(self, message: Any) -> None:
-        for channel in self._channels:
+        for channel in tuple(self._channels):
             channel.send(message, wait=False)
 
     async def _log(self, learners: Learners, channel: Channel, message: FramesToLog) -> None:

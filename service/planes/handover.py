@@ -24,11 +24,18 @@ MAX_QUERY_BYTES = 16 * 1024
 """Max size of a request that the data plane answers, with its headers."""
 PART, OTHER = 0, -1
 """Results of `find_query`: the rest of the query is missing; there is no query."""
-_STARTS = (b"POST /v1/models/", b"POST /v1/echo ", b"GET /v1/models/", b"GET /v1/echo/stream", b"GET /health/live ")
-_QUERY = re.compile(rb"(?:POST /v1/(?:models/[^/ ?]+/predict|echo)|GET /health/live) HTTP/1\.1\r\n")
+_STARTS = (
+    *(b"POST /v1/models/", b"POST /v1/echo ", b"POST /v2/models/"),
+    *(b"GET /v1/models/", b"GET /v1/echo/stream", b"GET /health/live "),
+)
+_QUERY = re.compile(
+    rb"(?:POST /v1/(?:models/[^/ ?]+/predict|echo)|POST /v2/models/[^/ ?]+(?:/versions/[^/ ?]+)?/infer|"
+    rb"GET /health/live) HTTP/1\.1\r\n"
+)
 _STREAM = re.compile(rb"GET /v1/(?:models/[^/ ?]+|echo)/stream(?:\?[^ ]*)? HTTP/1\.1\r\n")
 _HEADERS = re.compile(rb"(?:[!-9;-~]+:[^\x00-\x08\x0a-\x1f\x7f]*\r\n)*\r\n")
-_LENGTH = re.compile(rb"\r\ncontent-length:[ \t]*(\d{1,9})[ \t]*\r\n", re.IGNORECASE)
+_LENGTH = re.compile(rb"\r\ncontent-length:([^\r]*)", re.IGNORECASE)
+_NUMBER = re.compile(rb"[ \t]*(\d{1,9})[ \t]*")
 _BODY = re.compile(rb"\r\n(?:transfer-encoding|content-length|content-encoding|expect):", re.IGNORECASE)
 _ELSE = re.compile(rb"\r\n(?:transfer-encoding|content-encoding|expect|upgrade):", re.IGNORECASE)
 
@@ -47,10 +54,11 @@ def find_query(data: bytes) -> int:
         return OTHER
     if line.re is _STREAM:
         return OTHER if _BODY.search(data, 0, end) else len(data)
-    lengths = _LENGTH.findall(data, 0, end)
-    if len(lengths) > 1 or _ELSE.search(data, 0, end):
+    lengths = _LENGTH.findall(data, 0, end) or [b"0"]
+    number = _NUMBER.fullmatch(lengths[0])
+    if number is None or len(lengths) > 1 or _ELSE.search(data, 0, end):
         return OTHER
-    size = end + int(lengths[0]) if lengths else end
+    size = end + int(number[1])
     if size > MAX_QUERY_BYTES:
         return OTHER
     return size if size <= len(data) else PART

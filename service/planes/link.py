@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,12 @@ from typing import Any
 from service.api.access.keys import Keyring
 from service.foundation.settings import Settings
 from service.planes.channel import Channel
-from service.planes.counting import ConnectionReport, NoneIdle, PassedConnections
+from service.planes.counting import ConnectionReport, ConnectionShed, PassedConnections
 from service.planes.frames import FramesLogged, RemoteLearners
 from service.planes.handover import Handed, adopt, pass_on
 from service.planes.publications import KeysRead
 from service.planes.published import PublishedModels
+from service.runtime.realtime import PRIORITY, enter_real_time
 
 logger = logging.getLogger(__name__)
 RECONNECT_S = 0.05
@@ -41,7 +43,7 @@ class ControlLink:
         self.published = self.loaded.ready
         self.learners = RemoteLearners(settings, self.loaded, self._send_at_once)
         self.passed = PassedConnections(self._send_at_once)
-        self._path = path
+        self._path, self._closed = path, False
         self._channel: Channel | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._protocol: Callable[..., asyncio.Protocol] | None = None
@@ -61,6 +63,12 @@ class ControlLink:
             self.keyring.end_lasting()
         assert self._loop is not None
         self._loop.call_later(REPORT_S, self._report)
+
+    def close(self) -> None:
+        """Close the channel for good."""
+        self._closed = True
+        if (channel := self._channel) is not None:
+            channel.close()
 
     def pass_on(self, transport: asyncio.Transport, handed: Handed, peer: str | None) -> bool:
         """Pass a connection to the control plane, see `PassOn`."""
@@ -82,7 +90,9 @@ class ControlLink:
         return channel is not None and channel.send(message, fds, wait)
 
     def _run(self) -> None:
-        while True:
+        # the event loop waits for this thread when it needs Python's lock: other processes must not interrupt it
+        enter_real_time(PRIORITY - 1, lock_pages=False)
+        while not self._closed:
             try:
                 self._channel = channel = Channel.connect(self._path)
             except OSError:
@@ -108,8 +118,8 @@ class ControlLink:
                 self._on_loop(self.learners.receive, message)
             case ConnectionReport():
                 self._on_loop(self.passed.update, message)
-            case NoneIdle():
-                self._on_loop(self.passed.note_busy)
+            case ConnectionShed():
+                self._on_loop(self.passed.receive, message)
             case KeysRead(keys) if self.keyring is not None:
                 self.keyring.update(keys)
                 self._on_loop(self.keyring.end_lasting)
@@ -126,4 +136,5 @@ class ControlLink:
 
     def _on_loop(self, call: Callable[..., None], *given: Any) -> None:
         if self._loop is not None:
-            self._loop.call_soon_threadsafe(call, *given)
+            with suppress(RuntimeError):  # closed: this process ends
+                self._loop.call_soon_threadsafe(call, *given)

@@ -1,169 +1,161 @@
-"""The parent of both planes: it owns the port, imports everything once, forks, and starts again what ended."""
+"""The parent of both planes: it forks their processes, and restarts those that end or hang.
+
+It has no threads and answers nothing. Its children end with it.
+"""
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import gc
 import logging
-import mmap
 import os
 import signal
-import socket
-import sys
-import tempfile
 import time
-import traceback
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 
-import numpy as np
-import uvicorn
-
-from service.api.server import sockets
-from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
-from service.app import create_app
-from service.foundation.settings import Settings
-from service.models import registry
-from service.models.loading import PRELOADED
-from service.planes import control, data, nursery
-from service.planes.confirmations import confirm_answers
-from service.runtime import companion
-from service.runtime.allocator import limit_free_memory
-from service.storage.database import Database
-from service.storage.files import Files
+from service.planes.pulse import Plane, Pulse, Watch
+from service.runtime import forking
 
 logger = logging.getLogger(__name__)
-BACKLOG = 2048
-PR_SET_PDEATHSIG = 1
-POLL_S, MAX_SILENT_S = 0.1, 0.5
-"""Seconds between two looks at the data plane's heartbeat, and without one after which it is killed."""
-SIGNALS = (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT)
+POLL_S = 0.1
+"""Seconds between two looks at the heartbeats."""
+MAX_SILENT_S = {Plane.DATA: 0.5, Plane.CONTROL: 60.0}
+"""Seconds without a heartbeat after which a plane is killed. The data plane goes on if the control plane hangs."""
+WARNING_S = 5.0
+"""Seconds without a heartbeat after which the log mentions the control plane."""
+MIN_PAUSE_S, MAX_PAUSE_S = 0.1, 10.0
+"""Pause before the second restart of a process, doubled each time, and its max. The first restart is at once."""
+MIN_LIFE_S = 30.0
+"""A process that lived this long starts again without a pause."""
+MAX_ORPHAN_S = 2.0
+"""Max wait of a new control plane for the end of the processes that its predecessor started, s."""
+STOPS = (signal.SIGTERM, signal.SIGINT)
 
 
-def serve(settings: Settings) -> None:
-    """Serve until a signal; see the module's docstring."""
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listener = socket.create_server((settings.host, settings.port), family=family, backlog=BACKLOG)
-    with tempfile.TemporaryDirectory(prefix="lipserve-") as folder:
-        link, lock = Path(folder) / "link", Path(folder) / "lock"
-        accepting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        accepting.bind(os.fspath(link))
-        accepting.listen(8)
-        _import_all(settings)
+@dataclass
+class Child:
+    """A process of a plane, and when it is due to start."""
 
-        def start_control() -> None:
-            listener.close()
-            _control(settings, accepting)
+    plane: Plane
+    work: Callable[[], None]
+    name: str
+    pid: int | None = None
+    began: float = -float("inf")
+    due: float = 0.0
+    pause_s: float = 0.0
 
-        def start_data() -> None:
-            accepting.close()
-            data.run(settings, listener, link, lock, beats)
+    def start(self) -> None:
+        """Fork it; try again later if the system refuses."""
+        try:
+            self.pid, self.began = forking.fork(self.work, self.name), time.monotonic()
+        except OSError as error:
+            logger.error("the %s process could not be started: %s", self.name, error)
+            self.put_off()
 
-        beats = mmap.mmap(-1, mmap.PAGESIZE)  # shared with all that are forked
-        _supervise({"control": start_control, "data": start_data, "spare": start_data}, beats)
-
-
-def _import_all(settings: Settings) -> None:
-    """Import what both planes need, and load the serving versions, so that their pages are shared."""
-    import anyio._backends._asyncio  # noqa: F401, PLC0415 - AnyIO imports it at its first use
-
-    import service.learning.learner.worker  # noqa: PLC0415
-    import service.learning.weigher.worker  # noqa: F401, PLC0415
-    from lipcore.model.payload import Carrier  # noqa: PLC0415
-
-    database, files = Database.of(settings), Files.of(settings)
-    with contextlib.suppress(Exception):  # a new home
-        recent = registry.serving(database, registry.recent(database, settings.max_loaded_models))
-        for model, serving in recent.items():
-            row = registry.find(database, model, serving.version)
-            base = PRELOADED[row.folder] = files.load_version(row.folder, row.checksums)
-            base.warm_up()
-            base.answer(np.zeros((3, base.n_joints)))
-            if base.arm is not None:
-                Carrier(base).warm_up()
-    database.close()
-    gc.collect()
-    gc.freeze()
+    def put_off(self) -> None:
+        """Choose when it starts again."""
+        now = time.monotonic()
+        self.pause_s = 0.0 if now - self.began >= MIN_LIFE_S else self.pause_s
+        self.pid, self.due = None, now + self.pause_s
+        self.pause_s = min(max(MIN_PAUSE_S, 2 * self.pause_s), MAX_PAUSE_S)
 
 
-def _supervise(kinds: dict[str, Callable[[], None]], beats: mmap.mmap) -> None:
-    running, stopping = dict[int, str](), False
-    seen, at = (0, 0), time.monotonic()
+class Supervisor:
+    """Starts processes, restarts those that end or hang, and stops them in order.
 
-    def stop() -> None:
-        nonlocal stopping
-        stopping = True
-        for pid, name in running.items():
-            if name != "control":
-                os.kill(pid, signal.SIGTERM)
+    when_stopping: called when the stop begins.
+    """
 
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
-    for name, work in kinds.items():
-        running[_fork(work, name)] = name
-    while running:
-        looked = time.monotonic()
-        caught = signal.sigtimedwait(SIGNALS, POLL_S)
-        if caught is not None and caught.si_signo != signal.SIGCHLD:
-            stop()
-        now, beat = time.monotonic(), data.BEAT.unpack_from(beats)
-        if beat != seen or now - looked > MAX_SILENT_S / 2:  # else this process was stopped too
-            seen, at = beat, now
-        elif now - at > MAX_SILENT_S and beat[0] in running and not stopping:
-            logger.error("the data plane %d hangs and is killed", beat[0])
-            os.kill(beat[0], signal.SIGKILL)
-            at = now
-        pid, status = os.waitpid(-1, os.WNOHANG)
-        if not pid:
-            continue
-        name = running.pop(pid, "")
-        if not stopping:
+    def __init__(self, children: Sequence[Child], pulse: Pulse, when_stopping: Callable[[], None]) -> None:
+        self.children, self.pulse, self._when_stopping = children, pulse, when_stopping
+        self._watches = [Watch(pulse, plane, most) for plane, most in MAX_SILENT_S.items()]
+        self._warning = Watch(pulse, Plane.CONTROL, WARNING_S)
+        self._ending: int | None = None
+        self._last_stop = False
+
+    def run(self) -> int:
+        """Return the exit code: that of a failed start, 0 after Ctrl-C, negative if a signal shall end this process."""
+        awaited = {signal.SIGCHLD, *STOPS}
+        signal.pthread_sigmask(signal.SIG_BLOCK, awaited)
+        signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # a control plane may get it before it has a handler
+        while True:
+            if self._ending is None:
+                self._start_due()
+            caught = signal.sigtimedwait(awaited, POLL_S)
+            if caught is not None and caught.si_signo in STOPS:
+                if self._ending is not None:
+                    self._send(signal.SIGKILL, *Plane)
+                    return -caught.si_signo
+                self._stop(0 if caught.si_signo == signal.SIGINT else -caught.si_signo)
+            self._reap()
+            if self._ending is None:
+                self._check_beats()
+            elif self._finish():
+                return self._ending
+
+    def _start_due(self) -> None:
+        now, pids = time.monotonic(), {child.pid for child in self.children}
+        for child in self.children:
+            if child.pid is not None or now < child.due:
+                continue
+            # what an earlier control plane has started must not work beside the new one's
+            orphaned = child.plane == Plane.CONTROL and now < child.due + MAX_ORPHAN_S and forking.kill_orphans(pids)
+            if not orphaned:
+                child.start()
+
+    def _stop(self, ending: int) -> None:
+        """Begin to stop, first the data plane: the control plane logs its last frames."""
+        self._ending = ending
+        self._when_stopping()
+        self._send(signal.SIGUSR1, Plane.CONTROL)  # it reports that the service stops
+        self._send(signal.SIGTERM, Plane.DATA)
+
+    def _finish(self) -> bool:
+        """Stop the control plane after the data plane; return whether all processes have ended."""
+        running = {child.plane for child in self.children if child.pid is not None}
+        if running == {Plane.CONTROL} and not self._last_stop:
+            self._last_stop = True
+            self._send(signal.SIGTERM, Plane.CONTROL)
+        return not running
+
+    def _reap(self) -> None:
+        with suppress(ChildProcessError):
+            while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                for child in self.children:
+                    if child.pid == ended[0]:
+                        self._handle_end(child, os.waitstatus_to_exitcode(ended[1]))
+
+    def _handle_end(self, child: Child, code: int) -> None:
+        """Let a process that has ended start again, or stop the service if that has not started yet."""
+        pid, name = child.pid, child.plane.name.lower()
+        child.put_off()
+        if self._ending is not None:
+            return
+        if not self.pulse.last_beat(Plane.DATA).pid:
+            logger.error("the %s plane ended with exit code %d before the service had started", name, code)
+            self._stop(code if code > 0 else forking.FAILED)
+            return
+        logger.error("process %s of the %s plane ended with exit code %d; it is started again", pid, name, code)
+        self.pulse.record_restart(child.plane)
+        for watch in (*self._watches, self._warning):
+            watch.restart()
+
+    def _check_beats(self) -> None:
+        pids = [child.pid for child in self.children]
+        if (silence := self._warning.silent()) is not None:
             logger.error(
-                "the %s process %d ended (%d); it is started again", name, pid, os.waitstatus_to_exitcode(status)
+                "the control plane has not answered for %.0f s: queries are answered, but nothing is learnt", silence[1]
             )
-            running[_fork(kinds[name], name)] = name
-        elif set(running.values()) == {"control"}:  # after the data plane, whose last frames it logs
-            os.kill(next(iter(running)), signal.SIGTERM)
+            self._warning.restart()
+        for watch in self._watches:
+            if (silence := watch.silent()) is None or silence[0] not in pids:
+                continue
+            name = watch.plane.name.lower()
+            logger.error("the %s plane hangs and is killed: no heartbeat for %.1f s", name, silence[1])
+            watch.restart()
+            os.kill(silence[0], signal.SIGKILL)
 
-
-def _fork(work: Callable[[], None], name: str) -> int:
-    pid = os.fork()
-    if pid:
-        return pid
-    try:
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
-        limit_free_memory()
-        with contextlib.suppress(OSError):
-            Path("/proc/self/comm").write_text(f"lip-{name}")
-        work()
-    except BaseException:
-        traceback.print_exc()
-        time.sleep(0.2)
-        os._exit(1)
-    sys.stdout.flush()
-    os._exit(0)
-
-
-def _control(settings: Settings, link: socket.socket) -> None:
-    nursery.start()
-    companion.FORK = nursery.fork
-    served = create_app(settings)
-    confirm_answers(served)
-    config = uvicorn.Config(
-        served,
-        log_config=None,
-        access_log=False,
-        loop="uvloop",
-        http=guarded(settings),
-        ws=StreamProtocol,
-        ws_max_size=MAX_FRAME_BYTES,
-        ws_per_message_deflate=False,
-        timeout_keep_alive=settings.keep_alive_s,
-        timeout_graceful_shutdown=sockets.DRAIN_S,
-        forwarded_allow_ips=settings.trusted_proxies,
-    )
-    server: Any = control.ControlServer(config, None, served.state.stopping, settings.stop_notice_s)
-    server.app, server.link = served, link
-    server.run()
+    def _send(self, number: int, *planes: Plane) -> None:
+        for child in self.children:
+            if child.pid is not None and child.plane in planes:
+                os.kill(child.pid, number)

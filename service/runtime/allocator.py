@@ -33,8 +33,18 @@ class Mallopt(IntEnum):
 def limit_free_memory(environment: Mapping[str, str] = os.environ) -> bool:
     """Limit the heaps and the free memory of this process for its lifetime; return whether it does.
 
-    Call it before any thread starts. It does nothing if the environment has settings of its own, or the C library is
-    not glibc.
+    Call it before any thread starts. See `limit_heaps`.
+    """
+    if not limit_heaps(environment):
+        return False
+    threading.Thread(target=_release_memory_often, name="release-memory", daemon=True).start()
+    return True
+
+
+def limit_heaps(environment: Mapping[str, str] = os.environ) -> bool:
+    """Limit the heaps of this process and of those that it forks; return whether it does.
+
+    It does nothing if the environment has settings of its own, or the C library is not glibc.
     """
     if any(name.startswith(("MALLOC_", "GLIBC_TUNABLES")) for name in environment):
         return False
@@ -47,7 +57,6 @@ def limit_free_memory(environment: Mapping[str, str] = os.environ) -> bool:
         (Mallopt.TRIM_THRESHOLD, BLOCK_BYTES),
     )
     taken = [library.mallopt(parameter, value) for parameter, value in settings]
-    threading.Thread(target=_release_memory_often, name="release-memory", daemon=True).start()
     return all(taken)
 
 

@@ -18,6 +18,8 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from service.foundation.settings import Settings
+from service.runtime import nursery
+from service.runtime.nursery import Forked
 from service.runtime.process import ProcessOptions, call, start_process
 from service.runtime.progress import CHECK_S, Progress
 
@@ -40,9 +42,6 @@ class CompanionOptions:
 
 COMPANION = CompanionOptions()
 
-
-FORK: Callable[..., Any] | None = None
-"""Forks a process from one that has imported the numerics already; None: start new interpreters. Prototype."""
 BEAT, BEAT_S = "beat", 1.0
 """Message of the process after a step, and the min seconds between two of them."""
 Work = dict[Hashable, list[Any]]
@@ -74,7 +73,7 @@ class Companion:
         self._changed = threading.Condition()
         self._work: Work = {}
         self._connection: Connection | None = None
-        self._process: BaseProcess | None = None
+        self._process: BaseProcess | Forked | None = None
         self._progress: Progress | None = None
         self._threads: list[threading.Thread] = []
         self._closing = False
@@ -164,20 +163,29 @@ class Companion:
             self._changed.wait_for(lambda: self._closing, pause)
         return min(2 * pause, COMPANION.max_pause_s)
 
-    def _start(self) -> tuple[Connection, BaseProcess]:
+    def _start(self) -> tuple[Connection, BaseProcess | Forked]:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        if FORK is not None:
-            forked: BaseProcess = FORK(f"lipserve-{self.name}", (self.place, self._run, self.settings), theirs)
-            theirs.close()
-            return ours, forked
-        arguments = self.place, self._run, self.settings, theirs
-        process = context.Process(target=_begin, args=arguments, daemon=True, name=f"lipserve-{self.name}")
-        process.start()
-        theirs.close()  # the process has its own copy: an open copy here would hide its end
-        return ours, process
+        given = self.place, self._run, self.settings
+        with theirs:  # the process has its own copy: an open copy here would hide its end
+            if (forked := self._fork(theirs, *given)) is not None:
+                return ours, forked
+            name = f"lipserve-{self.name}"
+            process = context.Process(target=_begin, args=(*given, theirs), daemon=True, name=name)
+            process.start()
+            return ours, process
 
-    def _listen(self, connection: Connection, process: BaseProcess) -> None:
+    def _fork(self, theirs: Connection, *given: Any) -> Forked | None:
+        """Return a process that shares the imports of this one; None if there is no nursery."""
+        if (forks := nursery.current()) is None:
+            return None
+        try:
+            return forks.start(self.name, self.place, theirs, _begin, *given)
+        except OSError as error:
+            logger.warning("the %s process is started as a new interpreter: %s", self.name, error)
+            return None
+
+    def _listen(self, connection: Connection, process: BaseProcess | Forked) -> None:
         """Pass on the messages of the process until it ends; kill it if it hangs."""
         pids = () if process.pid is None else (process.pid,)
         progress = self._progress = Progress(lambda: pids, COMPANION.quiet_s, COMPANION.step_s)

@@ -7,27 +7,30 @@ from contextlib import contextmanager
 from typing import ClassVar
 
 from service.foundation.errors import BusyError
+from service.telemetry.counters import Gauge, new_gauge
 
 
 class OpenCounter:
     """Counts open things of one kind.
 
     too_many: message of the error beyond the limit, with a place for the number. headers: sent with the error.
+    gauge: their number, which processes may share.
     """
 
     too_many: ClassVar[str]
     headers: ClassVar[dict[str, str]] = {}
 
-    def __init__(self) -> None:
-        self.open = 0
+    def __init__(self, gauge: Gauge | None = None) -> None:
+        self._gauge = new_gauge() if gauge is None else gauge
 
     @contextmanager
     def count_one(self, most: int) -> Iterator[None]:
         """Count one for the duration of the block; raise BusyError beyond `most`."""
-        if self.open >= most:
-            raise BusyError(self.too_many.format(self.open), headers=self.headers)
-        self.open += 1
+        already = self._gauge.total
+        if already >= most:
+            raise BusyError(self.too_many.format(already), headers=self.headers)
+        self._gauge.add(1)
         try:
             yield
         finally:
-            self.open -= 1
+            self._gauge.add(-1)

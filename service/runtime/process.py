@@ -76,7 +76,7 @@ def training_cpus(available: set[int], most: int | None) -> frozenset[int]:
 def start_process(place: ProcessOptions) -> None:
     """Prepare a process of a pool: set its options, ignore Ctrl-C, and end it with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its processes
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(place.threads)))
+    limit_library_threads(place.threads)
     os.nice(place.niceness)
     logs.configure(place.log)
     try:
@@ -89,6 +89,11 @@ def start_process(place: ProcessOptions) -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def limit_library_threads(count: int) -> None:
+    """Set the number of threads of the numerical libraries that this process imports later."""
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(count)))
 
 
 def call(module: str, function: str, *given: Any) -> None:

@@ -1,19 +1,22 @@
 """Counters of requests and streams, and the declaration of metrics.
 
-The counters are plain numbers, changed only by the event loop. The labels and locks of prometheus-client's own counters
-cost over 3 µs a request; these cost a few tenths. A metric's declaration makes its families and its line in the
-documentation.
+The counters are plain numbers, changed only by the event loop of their process. The labels and locks of
+prometheus-client's own counters cost over 3 µs a request; these cost a few tenths. A metric's declaration makes its
+families and its line in the documentation.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
+
+from service.telemetry.counters import Counters, Counts, Reals, Tally
 
 BUCKET_BOUNDS_S = (
     *(0.000_05, 0.000_1, 0.000_25, 0.000_5, 0.001, 0.002, 0.005, 0.01, 0.025),
@@ -28,18 +31,30 @@ MAX_MODELS = 200
 
 
 class Durations:
-    """A histogram of durations. bounds: upper bounds of its buckets, s."""
+    """A histogram of durations. bounds: upper bounds of its buckets, s; tally: where it counts."""
 
-    __slots__ = ("bounds", "counts", "total")
+    __slots__ = ("_sum", "bounds", "counts")
 
-    def __init__(self, bounds: tuple[float, ...] = BUCKET_BOUNDS_S) -> None:
-        self.bounds, self.counts = bounds, [0] * (len(bounds) + 1)
-        self.total = 0.0
+    def __init__(self, bounds: tuple[float, ...] = BUCKET_BOUNDS_S, tally: Tally | None = None) -> None:
+        self.bounds = bounds
+        self.counts: Counts = [0] * (len(bounds) + 1) if tally is None else tally.counts
+        self._sum: Reals = [0.0] if tally is None else tally.reals
+
+    @property
+    def total(self) -> float:
+        """The sum of all durations, s."""
+        return self._sum[0]
 
     def add(self, seconds: float) -> None:
         """Count one duration."""
         self.counts[bisect_left(self.bounds, seconds)] += 1
-        self.total += seconds
+        self._sum[0] += seconds
+
+    def merge(self, other: Durations) -> None:
+        """Add those of another histogram with the same bounds."""
+        for bucket in range(len(self.bounds) + 1):
+            self.counts[bucket] += other.counts[bucket]
+        self._sum[0] += other.total
 
 
 class Kind(NamedTuple):
@@ -56,16 +71,19 @@ class Kind(NamedTuple):
 
 
 class RequestMeter:
-    """Answered requests by kind, and the number of requests in progress.
+    """Answered requests by kind, and the number of requests and streams in progress.
 
-    `known` maps the plain tuple of a kind's fields to its durations. `find` is the slow way, for a new kind.
+    `known` maps the plain tuple of a kind's fields to its durations in this process. `find` is the slow way, for a new
+    kind.
     """
 
-    def __init__(self, most_models: int) -> None:
+    def __init__(self, most_models: int, counters: Counters | None = None) -> None:
         self.known: dict[tuple[str, str, str, int, str], Durations] = {}
-        self.in_flight = 0
-        self.streams = 0
-        self._models: set[str] = set()
+        self._counters = Counters() if counters is None else counters
+        self.in_flight, self.streams = self._counters.gauge("requests"), self._counters.gauge("streams")
+        self._models = {labels[2] for labels in self._counters.tallies(_REQUEST)}
+        self._models |= {labels[0] for labels in self._counters.tallies(_STREAM)}
+        self._models -= {"", OTHER}
         self._most_models = most_models
 
     def find(self, kind: Kind, exists: bool) -> Durations:
@@ -75,7 +93,10 @@ class RequestMeter:
         """
         method = kind.method if kind.method in METHODS else OTHER
         kind = kind._replace(method=method, model=self.label(kind.model) if exists else "")
-        return self.known.setdefault(kind, Durations())
+        durations = self.known.get(kind)
+        if durations is None:
+            durations = self.known[kind] = Durations(tally=self._counters.tally(_REQUEST, *map(str, kind)))
+        return durations
 
     def label(self, model: str) -> str:
         """Return the label of an existing model: its name, or OTHER if there are too many models."""
@@ -86,6 +107,13 @@ class RequestMeter:
         self._models.add(model)
         return model
 
+    def totals(self) -> Mapping[Kind, Durations]:
+        """Return the durations of all kinds, of all processes of the service."""
+        found: dict[Kind, Durations] = {}
+        for (method, route, model, status, code), tallies in self._counters.tallies(_REQUEST).items():
+            found[Kind(method, route, model, int(status), code)] = _sum_durations(tallies)
+        return found
+
 
 class StreamMeter:
     """Frames of the streams of one model.
@@ -94,32 +122,80 @@ class StreamMeter:
     number of answers after their deadline.
     """
 
-    __slots__ = ("durations", "late", "refused")
+    __slots__ = ("_counters", "_late", "_model", "_refused", "durations")
 
-    def __init__(self) -> None:
-        self.durations = Durations()
-        self.refused: dict[str, int] = {}
-        self.late = 0
+    def __init__(self, counters: Counters | None = None, model: str = "") -> None:
+        self._counters, self._model = Counters() if counters is None else counters, model
+        self.durations = Durations(tally=self._counters.tally(_STREAM, model))
+        self._late = self._counters.tally(_LATE, model).counts
+        self._refused: dict[str, Tally] = {}
+
+    @property
+    def late(self) -> int:
+        """Number of answers after their deadline, in this process."""
+        return self._late[0]
+
+    def count_late(self) -> None:
+        """Count an answer after its deadline."""
+        self._late[0] += 1
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Number of frames by error code, in this process."""
+        return {code: tally.counts[0] for code, tally in self._refused.items()}
 
     def refuse(self, code: str) -> None:
         """Count a frame that was answered with an error."""
-        self.refused[code] = self.refused.get(code, 0) + 1
+        if (tally := self._refused.get(code)) is None:
+            tally = self._refused[code] = self._counters.tally(_REFUSED, self._model, code)
+        tally.counts[0] += 1
+
+
+@dataclass(frozen=True)
+class StreamTotals:
+    """Frames of the streams of one model in all processes; see `StreamMeter`."""
+
+    durations: Durations
+    late: int
+    refused: Mapping[str, int]
 
 
 class Meters:
-    """All counters of one service since its start. most_models: max models with labels of their own."""
+    """All counters of one process. most_models: max models with labels of their own; counters: where it counts."""
 
-    def __init__(self, most_models: int = MAX_MODELS) -> None:
-        self.requests = RequestMeter(most_models)
+    def __init__(self, most_models: int = MAX_MODELS, counters: Counters | None = None) -> None:
+        self.counters = Counters() if counters is None else counters
+        self.requests = RequestMeter(most_models, self.counters)
         self._streams: dict[str, StreamMeter] = {}
 
     def stream(self, model: str) -> StreamMeter:
         """Return the meter of an existing model's streams."""
-        return self._streams.setdefault(self.requests.label(model), StreamMeter())
+        label = self.requests.label(model)
+        if (meter := self._streams.get(label)) is None:
+            meter = self._streams[label] = StreamMeter(self.counters, label)
+        return meter
 
-    def streams(self) -> Mapping[str, StreamMeter]:
-        """Return a copy of the meters of streams by model."""
-        return dict(self._streams)
+    def streams(self) -> Mapping[str, StreamTotals]:
+        """Return the totals of streams by model, of all processes of the service."""
+        late, refused = self.counters.tallies(_LATE), defaultdict[str, dict[str, int]](dict)
+        for (model, code), tallies in self.counters.tallies(_REFUSED).items():
+            refused[model][code] = _sum_counts(tallies)
+        return {
+            model: StreamTotals(_sum_durations(tallies), _sum_counts(late.get((model,), ())), refused[model])
+            for (model,), tallies in self.counters.tallies(_STREAM).items()
+        }
+
+
+_REQUEST, _STREAM, _LATE, _REFUSED = "request", "stream", "late", "refused"
+"""Kinds of tallies."""
+
+
+def _sum_durations(tallies: Iterable[Tally]) -> Durations:
+    return merge_durations(Durations(tally=tally) for tally in tallies)
+
+
+def _sum_counts(tallies: Iterable[Tally]) -> int:
+    return sum(tally.counts[0] for tally in tallies)
 
 
 _FAMILIES: dict[str, Any] = {
@@ -169,14 +245,13 @@ def merge_durations(parts: Iterable[Durations]) -> Durations:
     """Return the sum of the durations of several meters."""
     total = Durations()
     for part in parts:
-        total.counts = [ours + theirs for ours, theirs in zip(total.counts, part.counts, strict=True)]
-        total.total += part.total
+        total.merge(part)
     return total
 
 
 def _buckets(durations: Durations) -> Iterator[tuple[str, float]]:
     """Yield upper bounds and cumulative counts, as Prometheus defines histograms."""
     below = 0
-    for bound, count in zip((*map(str, durations.bounds), "+Inf"), durations.counts, strict=True):
+    for bound, count in zip((*map(str, durations.bounds), "+Inf"), durations.counts, strict=False):
         below += count
         yield bound, below

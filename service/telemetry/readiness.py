@@ -61,16 +61,20 @@ class Readiness:
     def __init__(
         self, probes: Mapping[str, Probe], stopping: StopState, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.probes, self._stopping = probes, stopping
+        self.probes, self._stopping = dict(probes), stopping
         self._clock, self._lock = clock, threading.Lock()
         self._report, self._until = tuple[Check, ...](), -float("inf")
         self._wrong_since: dict[tuple[str, str], float] = {}
+
+    def add(self, name: str, probe: Probe) -> None:
+        """Add a part."""
+        self.probes[name] = probe
 
     def report(self) -> tuple[Check, ...]:
         """Return the state of all parts, at most MAX_REPORT_AGE_S old; never raise."""
         with self._lock:
             if self._clock() >= self._until:
-                self._report = tuple(self._check(name, probe) for name, probe in self.probes.items())
+                self._report = tuple(self._check(name, probe) for name, probe in list(self.probes.items()))
                 self._until = self._clock() + MAX_REPORT_AGE_S
             if self._stopping.begun:
                 return Check("stopping", "failed", "the service is stopping"), *self._report

@@ -16,6 +16,9 @@ from tests.service import backend
 from tests.service.data import DEADLINE, eventually
 from tests.service.warm import Served
 
+COMPANIONS = ("lip-learner", "lip-weigher")
+"""Names of processes that are forked, not spawned."""
+
 
 class Server:
     """`lipserve serve` on a home; settings are environment variables.
@@ -70,8 +73,12 @@ class Server:
         return [pid for pid in self.started() if os.getpriority(os.PRIO_PROCESS, pid) > own]
 
     def started(self) -> list[int]:
-        """Return process ids of all spawned processes: those of `workers`, and the one that estimates payloads."""
-        return [pid for pid in children(self.process.pid) if "spawn_main" in command(pid)]
+        """Return process ids of all of training, learning, and the one that estimates payloads."""
+        return [pid for pid in descendants(self.process.pid) if "spawn_main" in command(pid) or name(pid) in COMPANIONS]
+
+    def named(self, wanted: str) -> list[int]:
+        """Return process ids of the processes with a name, such as `lip-data`."""
+        return [pid for pid in descendants(self.process.pid) if name(pid) == wanted]
 
     def kill(self) -> None:
         """Kill it as a power cut would, with its children."""
@@ -107,6 +114,32 @@ def command(pid: int) -> str:
         return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
     except (FileNotFoundError, ProcessLookupError):
         return ""
+
+
+def name(pid: int) -> str:
+    """Return the name of a process, empty if it has ended."""
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
+def state(pid: int) -> str:
+    """Return the state of a process, such as R, S, T (stopped) or Z (zombie); empty if it has ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
+def is_running(pid: int) -> bool:
+    """Return whether a process exists, other than as a zombie."""
+    return state(pid) not in ("", "Z")
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the process ids of the children of a process, and of their descendants."""
+    return [each for child in children(pid) for each in (child, *descendants(child))]
 
 
 def children(pid: int) -> list[int]:

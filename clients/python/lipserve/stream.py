@@ -70,12 +70,15 @@ class StreamClient(StreamSide):
     """
 
     def _begin(self) -> None:
+        self._connect()
+        self._receive(self._patience)
+
+    def _connect(self) -> None:
         self._stack = ExitStack()
         address, host, port = self._destination
         with self._opening():
             made = _connect(host, port, self._unix, self._patience)
             self._socket = self._stack.enter_context(connect(address, sock=made, **self._options))
-        self._receive(self._patience)
 
     def __enter__(self) -> Self:
         return self

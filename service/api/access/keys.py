@@ -11,7 +11,7 @@ import re
 import secrets
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
 from hmac import compare_digest
@@ -22,11 +22,12 @@ from anyio import CapacityLimiter, to_thread
 from sqlalchemy import select, update
 
 from service.api.access.scopes import ADMIN, SCOPES
-from service.api.limits.requests import Rate
+from service.api.limits.rates import Buckets, Rate
 from service.foundation.errors import InvalidRequestError, RateLimitedError, UnauthorizedError
 from service.foundation.fields import check_name
 from service.storage.database import ApiKeyRow, Database, iso_time, now
 from service.storage.files import new_id
+from service.telemetry.counters import Counters
 
 PREFIX = "lip_"
 MIN_REQUESTS_PER_S, MAX_REQUESTS_PER_S = 1e-3, 1e6
@@ -42,13 +43,14 @@ class KeyRate:
 
     __slots__ = ("_rate", "per_s")
 
-    def __init__(self, per_s: float, burst: int) -> None:
+    def __init__(self, per_s: float, burst: int, buckets: Buckets) -> None:
         self.per_s = per_s
-        self._rate = Rate(per_s, max(1, min(burst, ceil(10.0 * per_s))))  # at most 10 s of its own rate at once
+        burst = max(1, min(burst, ceil(10.0 * per_s)))  # at most 10 s of its own rate at once
+        self._rate = Rate(per_s, burst, buckets)
 
     def count(self, key: str) -> None:
         """Count a request of the key; raise RateLimitedError if it exceeds the rate."""
-        if wait := self._rate.wait(key, monotonic()):
+        if wait := self._rate.wait((KeyRate, key), monotonic()):
             message = f"Too many requests with API key {key}: at most {self.per_s:g} per s."
             raise RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
 
@@ -76,8 +78,7 @@ class KeyRecord:
 class Key:
     """A stored key in memory. Times are Unix times in s.
 
-    `digest` is the key's sha256, `expires` is inf for a key without expiry, `rate` is its own limit, if any, and `seen`
-    is the last request that it authorised, 0 if there was none since the start.
+    `digest` is the key's sha256, `expires` is inf for a key without expiry, and `rate` is its own limit, if any.
     """
 
     id: str
@@ -86,7 +87,6 @@ class Key:
     expires: float
     revoked: bool
     rate: KeyRate | None = None
-    seen: float = field(default=0.0)
 
     def allows(self, scope: str) -> bool:
         """Return whether the key has a scope, directly or through `admin`."""
@@ -189,6 +189,8 @@ logger = logging.getLogger(__name__)
 
 PREFIX_BYTES = 16
 """Leading bytes of a digest that keys are looked up by. The whole digest is then compared in constant time."""
+_KEY = "key"
+"""Kind of the counters with the time of the last request that a key authorised, Unix time in s."""
 CHALLENGE = 'Bearer realm="lipserve"'
 
 
@@ -196,14 +198,19 @@ class Keyring:
     """The keys of one service, for its event loop. Empty until `watching` or `update`.
 
     `refresh_s` is the interval between reads of the database. `burst` limits the requests at once of a key with its own
-    rate. `records` are the keys as last read.
+    rate, which are counted in `buckets`. `counters` have the last use of each key. `records` are the keys as last
+    read.
     """
 
-    def __init__(self, refresh_s: float, burst: int) -> None:
+    def __init__(
+        self, refresh_s: float, burst: int, counters: Counters | None = None, buckets: Buckets | None = None
+    ) -> None:
         self._refresh_s, self._burst = refresh_s, burst
         self.records: tuple[KeyRecord, ...] = ()
         self.when_changed: list[Callable[[], None]] = []
         """Functions called after the keys have changed."""
+        self._counters = Counters() if counters is None else counters
+        self._buckets = Buckets() if buckets is None else buckets
         self._keys: dict[bytes, Key] = {}
         self._lasting: dict[Key, list[Callable[[], None]]] = {}
         self._noted: dict[str, float] = {}
@@ -228,7 +235,7 @@ class Keyring:
         at = time()
         if not key.valid(at):
             raise invalid_key(f"API key {key.id} {'was revoked' if key.revoked else 'has expired'}.")
-        key.seen = at
+        self._counters.tally(_KEY, key.id).reals[0] = at
 
     @contextmanager
     def lasting(self, key: Key, end: Callable[[], None]) -> Iterator[None]:
@@ -288,7 +295,7 @@ class Keyring:
             key = known.pop(record.id, None) or key_of(record)  # the same object, which streams and rates refer to
             key.scopes, key.expires, key.revoked = record.scopes, record.expires, record.revoked
             if record.max_requests_per_s is not None and key.rate is None:
-                key.rate = KeyRate(record.max_requests_per_s, self._burst)
+                key.rate = KeyRate(record.max_requests_per_s, self._burst, self._buckets)
             fresh[key.digest[:PREFIX_BYTES]] = key
         for gone in known.values():
             gone.revoked = True
@@ -310,7 +317,8 @@ class Keyring:
 
     async def _note_used(self, database: Database, seconds: float) -> None:
         """Store the last use of keys that were used more than `seconds` after the stored use."""
-        seen = {key.id: key.seen for key in self._keys.values() if key.seen > self._noted.get(key.id, 0.0) + seconds}
+        last = {key: max(each.reals[0] for each in tallies) for (key,), tallies in self._counters.tallies(_KEY).items()}
+        seen = {key: at for key, at in last.items() if at > self._noted.get(key, 0.0) + seconds}
         if not seen:
             return
         try:

@@ -1,4 +1,4 @@
-"""Limits of requests: their number, concurrent computations, rate per client, and size and time of bodies."""
+"""Limits of requests: their number, concurrent computations, and size and time of bodies."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv6Address, ip_address
-from math import ceil
 from time import monotonic
 from typing import Any, TypeVar
 
@@ -16,9 +15,10 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.errors import refuse
-from service.foundation.errors import BusyError, RateLimitedError
+from service.foundation.errors import BusyError
 from service.foundation.settings import Settings
 from service.models.archive_reading import MAX_ARCHIVE_BYTES, MAX_URDF_BYTES
+from service.telemetry.counters import Gauge, new_gauge
 from service.telemetry.logs import KEY_ID
 
 MAX_REQUESTS = 256
@@ -189,26 +189,30 @@ HEALTH = "/health"
 class Gate:
     """Middleware that limits the number of requests at a time. Streams have their own limit.
 
-    `open` is the number of requests that are being answered.
+    admitted: the number of requests that are being answered.
     """
 
-    def __init__(self, app: ASGIApp, max_requests: int) -> None:
-        self.app, self.max_requests, self.open = app, max_requests, 0
+    def __init__(self, app: ASGIApp, max_requests: int, admitted: Gauge | None = None) -> None:
+        self.app, self.max_requests, self.admitted = app, max_requests, new_gauge() if admitted is None else admitted
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on or answer 429."""
-        if scope["type"] != "http" or (self.open >= self.max_requests and scope["path"].startswith(HEALTH)):
+        if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        if self.open >= self.max_requests:
-            message = f"The service is busy with {self.open} requests, the max. Try again later."
+        admitted = self.admitted.total
+        if admitted >= self.max_requests:
+            if scope["path"].startswith(HEALTH):
+                await self.app(scope, receive, send)
+                return
+            message = f"The service is busy with {admitted} requests, the max. Try again later."
             await refuse(BusyError(message, headers={"Retry-After": "1"}), scope, receive, send)
             return
-        self.open += 1
+        self.admitted.add(1)
         try:
             await self.app(scope, receive, send)
         finally:
-            self.open -= 1
+            self.admitted.add(-1)
 
 
 @dataclass(frozen=True)
@@ -244,67 +248,9 @@ async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any)
 
 COUNTED = "lipserve.counted"
 """Marks the ASGI scope of a request that was already counted: by its key's own rate, or by another process."""
-MIN_CLEANUP_INTERVAL_S = 1.0
-"""Min time in s between two clean-ups of clients with full buckets."""
 NETWORK_BITS = 64
 """Leading bits of an IPv6 address that identify a client: a client can use all addresses with this prefix."""
-OTHERS, LOCAL = "others", "a local socket"
-
-
-class Rate:
-    """A token bucket per client: at most `burst` tokens, refilled at `per_s` tokens per second.
-
-    A bucket is stored as the time when it is full again. At most `max_clients` have their own bucket; the others share
-    one.
-    """
-
-    def __init__(self, per_s: float, burst: int, max_clients: int = 10_000) -> None:
-        self.step, self.depth, self.max_clients = 1 / per_s, burst / per_s, max_clients
-        self._full: dict[str, float] = {}
-        self._forgotten = -MIN_CLEANUP_INTERVAL_S
-
-    def wait(self, client: str, at: float) -> float:
-        """Use a token at a time in s. Return 0 if there was one, else the time in s until there is one."""
-        full = self._full.get(client)
-        if full is None and len(self._full) >= self.max_clients:
-            self._forget(at)
-            if len(self._full) >= self.max_clients:
-                client = OTHERS
-                full = self._full.get(client)
-        then = (at if full is None or full < at else full) + self.step
-        if then - at > self.depth * (1 + 1e-9):
-            return then - at - self.depth
-        self._full[client] = then
-        return 0.0
-
-    def _forget(self, at: float) -> None:
-        """Remove full buckets, which are the same as new ones."""
-        if at - self._forgotten >= MIN_CLEANUP_INTERVAL_S:
-            self._forgotten = at
-            self._full = {client: full for client, full in self._full.items() if full > at}
-
-
-class RateLimit:
-    """Middleware that limits the request rate of each client. It runs inside the middleware that checks keys.
-
-    A stream counts once, when it is opened.
-    """
-
-    def __init__(self, app: ASGIApp, per_s: float, burst: int) -> None:
-        self.app, self.per_s, self.rate = app, per_s, Rate(per_s, burst)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on or answer 429."""
-        if scope["type"] != "lifespan" and COUNTED not in scope and not scope["path"].startswith(HEALTH):
-            client = client_of(scope)
-            wait = self.rate.wait(client, monotonic())
-            if wait:
-                limit = f"at most {self.per_s:g} per s (LIPSERVE_MAX_REQUESTS_PER_S)"
-                message = f"Too many requests from {client}: {limit}."
-                error = RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
-                await refuse(error, scope, receive, send)
-                return
-        await self.app(scope, receive, send)
+LOCAL = "a local socket"
 
 
 def client_of(scope: Scope) -> str:

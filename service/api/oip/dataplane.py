@@ -20,6 +20,7 @@ from service.contract.models import ALIAS
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.models import registry
 from service.models.loaded import LoadedModels, ServedModel
+from service.models.served import AnsweringModels
 
 MAX_INLINE_BYTES = 16 * 1024
 """Max size of a body that is decoded on the event loop: many times one query of the largest robot."""
@@ -31,7 +32,7 @@ async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version:
 
     `turns` limits how many versions load at a time. Raise NotFoundError, which lists the existing versions.
     """
-    number, alias = (None, None) if version is None else _parse_version(version)
+    number, alias = _parse_version(version)
     served = loaded.hot(name, number, alias)
     if served is not None:
         return served
@@ -60,7 +61,7 @@ async def infer(
 
     `decode` decodes the body, which has `size` bytes. Raise ServiceError for a wrong request.
     """
-    settings, arrived = loaded.storage.settings, perf_counter()
+    settings, arrived = loaded.settings, perf_counter()
     served = await find(loaded, turns, name, version)
     timing = Timing()
     try:
@@ -68,7 +69,8 @@ async def infer(
             reply = await in_turn(turns, query.infer, served, decode, settings, sequences, arrived, timing)
         else:
             message = decode()
-            task = query.read_task(served, message, settings, sequences, arrived)
+            task = query.read_task(served, message, settings)
+            task = query.follow_sequence(served, message, task, sequences, arrived)
             timing.note_read(task.query.values.shape[1])
             if task.is_inline:
                 reply = query.respond(served, message, task)
@@ -77,6 +79,33 @@ async def infer(
     except Exception:
         statistics.fail(served.name, served.version, timing)
         raise
+    statistics.succeed(served.name, served.version, timing)
+    return reply
+
+
+def infer_at_once(
+    loaded: AnsweringModels,
+    sequences: Sequences,
+    statistics: Statistics,
+    name: str,
+    version: str | None,
+    decode: Callable[[], Message],
+) -> Reply | None:
+    """Answer a single query without waiting; return None for any other, and if its version is not in memory.
+
+    Raise ServiceError for a wrong request, which is not counted.
+    """
+    arrived, timing = perf_counter(), Timing()
+    served = loaded.hot(name, *_parse_version(version))
+    if served is None:
+        return None
+    message = decode()
+    task = query.read_task(served, message, loaded.settings)
+    if not task.is_inline:
+        return None
+    task = query.follow_sequence(served, message, task, sequences, arrived)
+    timing.note_read(task.query.values.shape[1])
+    reply = query.respond(served, message, task)
     statistics.succeed(served.name, served.version, timing)
     return reply
 
@@ -108,8 +137,10 @@ def _parameters(served: ServedModel, model: TorqueModel) -> dict[str, str | int]
     }
 
 
-def _parse_version(version: str) -> tuple[int | None, str | None]:
-    """Return a version's number or an alias; number 0, which no version has, if the text is neither."""
+def _parse_version(version: str | None) -> tuple[int | None, str | None]:
+    """Return a version's number or an alias, or neither; number 0, which no version has, if the text is wrong."""
+    if version is None:
+        return None, None
     if re.fullmatch(ALIAS, version):
         return None, version
     number = int(version) if version.isascii() and version.isdigit() and len(version) < 10 else 0

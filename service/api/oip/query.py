@@ -299,18 +299,14 @@ def infer(
     """
     timing.start()
     message = decode()
-    task = read_task(served, message, settings, sequences, arrived)
+    task = read_task(served, message, settings)
+    task = follow_sequence(served, message, task, sequences, arrived)
     timing.note_read(task.query.values.shape[1])
     return respond(served, message, task)
 
 
-def read_task(
-    served: ServedModel, message: Message, settings: Settings, sequences: Sequences, arrived: float
-) -> InferTask:
-    """Check a request against the version of its path, read it and follow its sequence; raise InvalidRequestError.
-
-    arrived: time of the request, of `time.perf_counter`.
-    """
+def read_task(served: ServedModel, message: Message, settings: Settings) -> InferTask:
+    """Check a request against the version of its path and read it; raise InvalidRequestError."""
     request = message.request
     for field, value, expected in (
         ("model_name", request.model_name, served.name),
@@ -318,7 +314,17 @@ def read_task(
     ):
         if value not in (None, expected):
             raise invalid_request(field, value, f"{expected}, as in the path")
-    task, part = read(message, served.model, settings), read_part(request)
+    return read(message, served.model, settings)
+
+
+def follow_sequence(
+    served: ServedModel, message: Message, task: InferTask, sequences: Sequences, arrived: float
+) -> InferTask:
+    """Return a task with the deflections of its sequence, which it continues; raise InvalidRequestError.
+
+    arrived: time of the request, of `time.perf_counter`.
+    """
+    part = read_part(message.request)
     if part is None or not served.model.remembers:
         return task
     return task._replace(deflections=sequences.follow(served, part, arrived, task.query.values[:2]))

@@ -109,6 +109,15 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
     )
 
 
+async def answer_at_once(scope: Scope, body: bytes) -> Reply | None:
+    """Answer a single query without waiting; return None for any other. Raise ServiceError for a wrong one."""
+    state, where = scope["app"].state, scope["path_params"]
+    decode = partial(wire.decode, body, scope["headers"])
+    return dataplane.infer_at_once(
+        state.loaded, state.sequences, state.statistics, where["model"], where.get("version"), decode
+    )
+
+
 @needs(PREDICT)
 async def infer(request: Request) -> Response:
     """Predict torque and other outputs for one query, [n], or a batch, [N, n], in JSON or binary.

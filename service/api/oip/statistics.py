@@ -6,6 +6,8 @@ import time
 from time import perf_counter_ns
 from typing import Any
 
+from service.telemetry.counters import Counters, Counts
+
 STAGES = ("success", "fail", "queue", "compute_input", "compute_infer", "compute_output", "cache_hit", "cache_miss")
 
 
@@ -29,50 +31,53 @@ class Timing:
         self.read, self.started, self.rows = perf_counter_ns() - self.started, perf_counter_ns(), rows
 
 
+_STATISTICS = "inference"
+"""Kind of the counters: number and time of each stage in ns, number of queries, and time of the last one in ms."""
+_PLACES = {stage: 2 * place for place, stage in enumerate(STAGES)}
+_ROWS, _LAST = 2 * len(STAGES), 2 * len(STAGES) + 1
+
+
 class Statistics:
     """Counters of all versions since the start of the service. They are changed only by the event loop."""
 
-    def __init__(self) -> None:
-        self._last: dict[tuple[str, int], int] = {}
-        self._rows: dict[tuple[str, int], int] = {}
-        self._stages: dict[tuple[str, int], dict[str, list[int]]] = {}
+    def __init__(self, counters: Counters | None = None) -> None:
+        self._counters = Counters() if counters is None else counters
 
     def succeed(self, model: str, version: int, timing: Timing) -> None:
         """Count an answered request."""
-        key, total = (model, version), perf_counter_ns() - timing.began
-        stages = self._of(key)
+        counts, total = self._counts(model, version), perf_counter_ns() - timing.began
         infer = total - timing.queue - timing.read
         parts = (("success", total), ("queue", timing.queue), ("compute_input", timing.read), ("compute_infer", infer))
         for name, ns in (*parts, ("compute_output", 0)):  # the answer is encoded while it is computed
-            stages[name][0] += 1
-            stages[name][1] += ns
-        self._rows[key] += timing.rows
-        self._last[key] = time.time_ns() // 1_000_000
+            _add(counts, name, ns)
+        counts[_ROWS] += timing.rows
+        counts[_LAST] = time.time_ns() // 1_000_000
 
     def fail(self, model: str, version: int, timing: Timing) -> None:
         """Count a rejected request."""
-        stage = self._of((model, version))["fail"]
-        stage[0] += 1
-        stage[1] += perf_counter_ns() - timing.began
+        _add(self._counts(model, version), "fail", perf_counter_ns() - timing.began)
 
     def show(self, model: str, version: int) -> dict[str, Any]:
         """Return the statistics of a version. Durations are sums, ns; `last_inference` is Unix time, ms."""
-        key = model, version
-        stages = self._stages.get(key, {})
-        counts = {name: stages.get(name, (0, 0)) for name in STAGES}
+        tallies = self._counters.tallies(_STATISTICS).get((model, str(version)), ())
+        totals = [sum(each.counts[place] for each in tallies) for place in range(_LAST)]
         return {
             "name": model,
             "version": str(version),
-            "last_inference": self._last.get(key, 0),
-            "inference_count": self._rows.get(key, 0),
-            "execution_count": counts["success"][0],
-            "inference_stats": {name: {"count": count, "ns": ns} for name, (count, ns) in counts.items()},
+            "last_inference": max((each.counts[_LAST] for each in tallies), default=0),
+            "inference_count": totals[_ROWS],
+            "execution_count": totals[_PLACES["success"]],
+            "inference_stats": {
+                name: {"count": totals[place], "ns": totals[place + 1]} for name, place in _PLACES.items()
+            },
             "batch_stats": [],
         }
 
-    def _of(self, key: tuple[str, int]) -> dict[str, list[int]]:
-        found = self._stages.get(key)
-        if found is None:
-            found = self._stages[key] = {name: [0, 0] for name in STAGES}
-            self._rows[key] = 0
-        return found
+    def _counts(self, model: str, version: int) -> Counts:
+        return self._counters.tally(_STATISTICS, model, str(version)).counts
+
+
+def _add(counts: Counts, stage: str, ns: int) -> None:
+    place = _PLACES[stage]
+    counts[place] += 1
+    counts[place + 1] += ns

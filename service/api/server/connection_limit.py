@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
@@ -34,9 +34,14 @@ class OtherConnections(Protocol):
         """Return the number of connections of a client."""
         ...
 
-    def shed(self, peer: str | None) -> bool:
-        """Let the other process close an idle connection of a client; return False if it has none."""
-        ...
+
+class Excess(NamedTuple):
+    """How many connections there are above a limit, and which limit that is."""
+
+    number: int
+    why: str = ""
+    peer: str | None = None
+    """The client whose own limit it is; None: the limit of all."""
 
 
 class ConnectionLimit:
@@ -44,7 +49,7 @@ class ConnectionLimit:
 
     First come connections without any request, then idle ones after an answer, then those of clients that do not read
     their answer; the oldest of each kind first. A connection that is being answered is never closed.
-    `others` are counted and closed too, after those of this process.
+    `others` are counted too, but not closed.
     """
 
     def __init__(self, settings: Settings, others: OtherConnections | None = None) -> None:
@@ -62,19 +67,19 @@ class ConnectionLimit:
             return None
         return network_of(client[0])
 
-    def admit(self, connection: LimitedConnection, present: Collection[Any]) -> tuple[int, str]:
+    def admit(self, connection: LimitedConnection, present: Collection[Any]) -> Excess:
         """Make room for a new connection; `present` are all connections, including this one.
 
-        Return the number of connections above a limit (0 if there is room now) and the reason.
+        Return the connections above a limit, 0 if there is room now.
         """
         self.adopt(connection)
-        beyond, why = self._beyond_own(connection, present)
-        if beyond <= 0 or self._make_room(connection, connection.peer):
-            beyond = len(present) + self._count_others(None) - len(self._leaving) - self.most
-            why = f"Too many connections: at most {self.most} (LIPSERVE_MAX_CONNECTIONS)."
-            if beyond <= 0 or self._make_room(connection, None):
-                return 0, ""
-        return beyond, why
+        own = self._beyond_own(connection, present)
+        if own.number > 0 and not self.shed(connection.peer, connection):
+            return own
+        beyond = len(present) + self._count_others(None) - len(self._leaving) - self.most
+        if beyond > 0 and not self.shed(None, connection):
+            return Excess(beyond, f"Too many connections: at most {self.most} (LIPSERVE_MAX_CONNECTIONS).")
+        return Excess(0)
 
     def adopt(self, connection: LimitedConnection) -> None:
         """Add a connection that another process has admitted."""
@@ -99,13 +104,14 @@ class ConnectionLimit:
         self.mark_busy(connection)
         self._leaving.discard(connection)
 
-    def _beyond_own(self, connection: LimitedConnection, present: Collection[Any]) -> tuple[int, str]:
+    def _beyond_own(self, connection: LimitedConnection, present: Collection[Any]) -> Excess:
         if connection.peer is None or len(present) + self._count_others(None) <= self.most_of_one:
-            return 0, ""
+            return Excess(0)
         own = sum(self._peer_of(each) == connection.peer for each in present if each not in self._leaving)
         own += self._count_others(connection.peer)
         limit = f"at most {self.most_of_one} (LIPSERVE_MAX_CONNECTIONS_PER_CLIENT)"
-        return own - self.most_of_one, f"Too many connections from {connection.peer}: {limit}."
+        why = f"Too many connections from {connection.peer}: {limit}."
+        return Excess(own - self.most_of_one, why, connection.peer)
 
     def _peer_of(self, connection: Any) -> str | None:
         if hasattr(connection, "peer"):
@@ -119,9 +125,6 @@ class ConnectionLimit:
 
     def _count_others(self, peer: str | None) -> int:
         return 0 if self.others is None else self.others.count(peer)
-
-    def _make_room(self, coming: LimitedConnection, peer: str | None) -> bool:
-        return self.shed(peer, coming) or (self.others is not None and self.others.shed(peer))
 
     def shed(self, peer: str | None, coming: LimitedConnection | None = None) -> bool:
         """Close the first idle connection except the new one, of one client if given; return whether there was one."""

@@ -23,7 +23,7 @@ from websockets.protocol import State
 
 from service.api.errors import refuse
 from service.api.limits.requests import HEALTH, PATIENCE, ClientPatience
-from service.api.server.connection_limit import ConnectionLimit, OtherConnections
+from service.api.server.connection_limit import ConnectionLimit, Excess, OtherConnections
 from service.foundation.errors import BusyError, ErrorBody, ErrorResponse
 from service.foundation.settings import Settings
 
@@ -52,17 +52,21 @@ class GuardedProtocol(HttpToolsProtocol):
         """Accept the connection, or refuse it if there are too many and none is idle."""
         super().connection_made(transport)
         self.peer = self.limit.find_peer(self.client)
-        beyond, why = self.admit()
-        if beyond > MAX_REFUSED_CONNECTIONS:
+        excess = self.admit()
+        if excess.number > MAX_REFUSED_CONNECTIONS:
             transport.abort()
             return
-        if beyond > 0:
-            self.refuse_requests(why)
+        if excess.number > 0:
+            self.exceed(excess)
         self._watch_head()
 
-    def admit(self) -> tuple[int, str]:
+    def admit(self) -> Excess:
         """Make room for this connection; see `ConnectionLimit.admit`."""
         return self.limit.admit(self, self.connections)
+
+    def exceed(self, excess: Excess) -> None:
+        """Act on a limit that this connection exceeds."""
+        self.refuse_requests(excess.why)
 
     def refuse_requests(self, why: str) -> None:
         """Answer all requests but health with 429."""

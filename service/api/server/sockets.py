@@ -22,7 +22,8 @@ from service.telemetry.readiness import StopState
 
 logger = logging.getLogger(__name__)
 
-BACKLOG = 128
+BACKLOG, PORT_BACKLOG = 128, 2048
+"""Connections that wait to be accepted, of a Unix-domain socket and of a port (uvicorn's default)."""
 DRAIN_S = 5
 """Max wait in s for running requests when the service stops."""
 
@@ -33,9 +34,14 @@ class SocketError(OSError):
 
 def check_port(host: str, port: int) -> None:
     """Check that the port is free; raise SocketError."""
+    open_port(host, port).close()
+
+
+def open_port(host: str, port: int) -> socket.socket:
+    """Return a listening socket; raise SocketError."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        socket.create_server((host, port), family=family).close()
+        return socket.create_server((host, port), family=family, backlog=PORT_BACKLOG)
     except OSError as error:
         reason = error.strerror or str(error)
         message = f"Cannot listen on port {port} of {host}: {reason}. Set another --port, or 0 for any free port."

@@ -21,6 +21,7 @@ from service.contract.predictions import one_choice
 from service.foundation.errors import NotFoundError, NotReadyError, invalid_request, readable
 from service.models.served import wait_for_revision
 from service.runtime.counted import OpenCounter
+from service.telemetry.counters import Gauge
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 NUMBER = "[0-9]{1,10}"
@@ -40,9 +41,9 @@ MIN_VALUES = {"version": 1, "min_revision": 0}
 PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
 
 
-def router() -> APIRouter:
-    """Return the routes, which count their connections together."""
-    streams = Streams()
+def router(admitted: Gauge) -> APIRouter:
+    """Return the routes, which count their connections together in `admitted`."""
+    streams = Streams(admitted)
     router = APIRouter()
     # objects, not functions: those Starlette would wrap in its own WebSocket
     router.add_websocket_route(PATH, StreamRoute(streams), name="stream")  # type: ignore[arg-type]

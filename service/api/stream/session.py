@@ -166,7 +166,7 @@ class Session(Conversation):
         seconds = perf_counter() - arrived
         self._meter.durations.add(seconds)
         if seconds > (budget or self._deadline):
-            self._meter.late += 1
+            self._meter.count_late()
             if budget:
                 self._late, flags = self._late + 1, flags | frames.LATE
         return frames.ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers

@@ -15,7 +15,7 @@ from service.learning.learners import Learners
 from service.models import registry
 from service.models.served import ServedModel
 from service.storage.rows import Page
-from service.telemetry.meters import OTHER, Meters, StreamMeter
+from service.telemetry.meters import OTHER, Durations, Meters, StreamTotals
 
 MAX_ALARMS = 5
 """Newest alarms in a status."""
@@ -88,7 +88,7 @@ class AnswerCounter:
         meter = self._meters.streams().get(self._model)
         if meter is None and OTHER in self._meters.streams():
             return None
-        meter = meter or StreamMeter()
+        meter = meter or StreamTotals(Durations(), 0, {})
         bounds, now = meter.durations.bounds, (list(meter.durations.counts), sum(meter.refused.values()), meter.late)
         before, self._before = self._before, now
         if before is None or passed is None:

@@ -104,7 +104,7 @@ def test_invented_names_are_no_labels(api):
 def test_service_reports_version_and_uptime(api):
     samples = scrape(api)
     assert value(samples, "lipserve_requests_in_flight") == 1  # this scrape
-    assert service_of(api).meters.requests.in_flight == 0
+    assert service_of(api).meters.requests.in_flight.total == 0
     assert value(samples, "lipserve_models_loaded") == len(service_of(api).loaded.versions())
     assert value(samples, "lipserve_disk_used_bytes", what="versions") > 1000
     assert value(samples, "lipserve_disk_free_bytes") > 0

@@ -1,5 +1,6 @@
 """The extensions of uvicorn match the installed and allowed versions, which `HOLDS_FOR` names."""
 
+import socket
 import tomllib
 from importlib.metadata import version
 
@@ -13,6 +14,9 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from service.api.server import HOLDS_FOR
 from service.api.server.connections import GuardedProtocol, StreamProtocol
 from service.api.server.sockets import Server
+from service.planes.control import ControlServer
+from service.planes.data import DataServer
+from service.planes.pulse import Pulse
 from tests import ROOT
 
 PYPROJECT = ROOT / "pyproject.toml"
@@ -24,6 +28,8 @@ REPLACED = {
     ),
     StreamProtocol: (WebSocketsSansIOProtocol, "data_received", "shutdown"),
     Server: (uvicorn.Server, "startup", "shutdown", "handle_exit"),
+    ControlServer: (uvicorn.Server, "startup", "handle_exit"),
+    DataServer: (uvicorn.Server, "startup", "shutdown", "handle_exit"),
 }
 """Methods of uvicorn that subclasses replace, and the classes that define them; uvicorn must call these names."""
 
@@ -43,3 +49,13 @@ def test_replaced_methods_exist(kind):
     for name in names:
         assert name in vars(kind), name
         assert callable(getattr(base, name)), name
+
+
+def test_message_of_a_start_names_the_address(caplog):
+    """The data plane logs it itself, as uvicorn logs none for listeners that it is given."""
+    caplog.set_level("INFO")
+    config = uvicorn.Config(print, port=0, lifespan="off", log_config=None)
+    config.load()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        DataServer(config, None, 0.0, Pulse())._log_started_message([listener])
+        assert f"running on http://127.0.0.1:{listener.getsockname()[1]}" in caplog.text

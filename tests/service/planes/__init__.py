@@ -1,0 +1,1 @@
+"""Tests of both planes: connections, frames and publications."""

@@ -17,7 +17,7 @@ from service.storage.database import Database, LearningRow
 from service.storage.files import Files
 from tests.service.data import DEADLINE, eventually
 from tests.service.learning.pendulums import trained_model
-from tests.service.server import Server, children, command
+from tests.service.server import Server, command, descendants
 from tests.system.faults.injection import TIMEOUT_S, Fault, Injector
 from tests.system.faults.ledger import ARM, Ledger
 
@@ -111,7 +111,7 @@ class FaultHarness:
 
         The service runs afterwards: it is restarted if the fault has killed it.
         """
-        self.orphans = children(self.server.process.pid)
+        self.orphans = descendants(self.server.process.pid)
         self.injector.arm(fault, self.server.process.pid)
         try:
             request(self)

@@ -25,7 +25,7 @@ from lipserve.states import ACTIVE
 from service.models.archive import MEDIA_TYPE
 from tests.service.data import QUICK, arrays, eventually, npz, stream
 from tests.service.robots.test_robots import urdf
-from tests.service.server import Server, children, command
+from tests.service.server import Server, command, descendants
 from tests.system.faults.harness import SETTINGS
 from tests.system.faults.injection import TIMEOUT_S
 from tests.system.faults.ledger import ARM, STREAM_ID, batch, query_rows
@@ -108,7 +108,7 @@ class RecordedService:
 
     def kill(self) -> None:
         """Kill the service and its children."""
-        orphans = children(self.server.process.pid)
+        orphans = descendants(self.server.process.pid)
         self.server.client.close()
         self.server.kill()
         eventually(lambda: all(command(pid) == "" for pid in orphans), TIMEOUT_S)

@@ -18,6 +18,18 @@ def check_installed(settings: Settings) -> bool:
     return True
 
 
+def choose_port(settings: Settings) -> Settings:
+    """Return settings with the number of a free gRPC port if they leave the choice to the system.
+
+    A process that takes the port over from another needs its number.
+    """
+    if settings.grpc_port != 0:
+        return settings
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    with socket.create_server((settings.host, 0), family=family) as free:
+        return settings.model_copy(update={"grpc_port": free.getsockname()[1]})
+
+
 def check_port(settings: Settings) -> None:
     """Check that the gRPC port is free; raise PortError."""
     if not settings.grpc_port:

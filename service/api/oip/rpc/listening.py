@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from contextlib import asynccontextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
@@ -16,11 +17,12 @@ from starlette.types import ASGIApp, Message, Scope
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from service.api.errors import UNEXPECTED_ERROR
-from service.api.limits.requests import MAX_REQUESTS, PATIENCE
+from service.api.limits.requests import COUNTED, MAX_REQUESTS, PATIENCE
 from service.api.oip.rpc import port_error
 from service.api.oip.rpc.definition import SERVICE
 from service.api.oip.rpc.messages import PROTOBUF
 from service.api.oip.rpc.methods import CALL, METHODS
+from service.api.requests import HANDED_OVER
 from service.api.server.sockets import DRAIN_S
 from service.foundation.settings import Settings
 from service.telemetry.readiness import StopState
@@ -46,27 +48,45 @@ _TRAILING = frozenset({b"x-request-id", b"retry-after", b"www-authenticate"})
 """Headers that are copied to the trailing metadata of a call."""
 ERROR_CODE = "lipserve-error-code"
 """Key of the trailing metadata with the code of an error, such as `invalid_request`."""
+CLIENT, COUNTED_CALL = "lipserve-client", "lipserve-counted"
+"""Keys of the metadata of a forwarded call: its client, and one that is there if rate limits have counted the call."""
+
+
+Forward = Callable[[str, bytes, Any, bool], Awaitable[bytes]]
+"""Answers a call in another process: its path, message and context, and whether rate limits have counted it."""
 
 
 @asynccontextmanager
-async def listening(app: ASGIApp, settings: Settings, stopping: StopState) -> AsyncIterator[int]:
+async def listening(
+    app: ASGIApp,
+    settings: Settings,
+    stopping: StopState,
+    forwarded_to: Path | None = None,
+    forward: Forward | None = None,
+) -> AsyncIterator[int]:
     """Serve calls while the context is open and yield the port; raise PortError.
 
     When the service stops, new calls are rejected, and running calls have as much time to end as HTTP requests.
+
+    forwarded_to: Unix-domain socket of calls that another process forwards, instead of a port; forward: answers the
+    calls that the application hands over.
     """
+    answer, proxied = _answer if forwarded_to is None else _answer_forwarded, _proxied(app, settings)
     handlers = {
-        path.rpartition("/")[2]: grpc.stream_unary_rpc_method_handler(partial(_answer, _proxied(app, settings), path))
+        path.rpartition("/")[2]: grpc.stream_unary_rpc_method_handler(partial(answer, proxied, path, forward))
         for path in METHODS
     }
     server = grpc.aio.server(options=_options(settings))
     server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, handlers),))
     host = f"[{settings.host}]" if ":" in settings.host else settings.host
     try:
-        port = server.add_insecure_port(f"{host}:{settings.grpc_port}")
+        address = f"{host}:{settings.grpc_port}" if forwarded_to is None else f"unix:{forwarded_to}"
+        port = server.add_insecure_port(address)
     except RuntimeError as error:
         raise port_error(settings, str(error)) from error
     await server.start()
-    logger.info("gRPC on %s:%d", host, port)
+    if forwarded_to is None:
+        logger.info("gRPC on %s:%d", host, port)
     stop = asyncio.create_task(_stop(server, stopping))
     try:
         yield port
@@ -103,13 +123,29 @@ def _proxied(app: ASGIApp, settings: Settings) -> ASGIApp:
     return made  # type: ignore[no-any-return]
 
 
-async def _answer(app: ASGIApp, path: str, _: Any, context: Any) -> bytes:
+async def _answer(app: ASGIApp, path: str, forward: Forward | None, _: Any, context: Any) -> bytes:
+    """Answer a call of a client."""
+    return await _ask(app, _scope(path, context, context.peer()), forward, context)
+
+
+async def _answer_forwarded(app: ASGIApp, path: str, forward: Forward | None, _: Any, context: Any) -> bytes:
+    """Answer a call that another process has forwarded, with its client."""
+    given = dict(context.invocation_metadata() or ())
+    scope = _scope(path, context, given.get(CLIENT, ""))
+    if COUNTED_CALL in given:
+        scope[COUNTED] = True
+    return await _ask(app, scope, forward, context)
+
+
+async def _ask(app: ASGIApp, scope: Scope, forward: Forward | None, context: Any) -> bytes:
     """Answer a call through the application, which reads the message under the limits of its middleware."""
-    status, headers, parts = 500, list[tuple[bytes, bytes]](), list[bytes]()
+    status, headers, parts, body = 500, list[tuple[bytes, bytes]](), list[bytes](), b""
 
     async def receive() -> Message:
+        nonlocal body
         sent = await context.read()
-        return {"type": "http.request", "body": b"" if sent is grpc.aio.EOF else sent, "more_body": False}
+        body = b"" if sent is grpc.aio.EOF else sent
+        return {"type": "http.request", "body": body, "more_body": False}
 
     async def send(answer: Message) -> None:
         nonlocal status, headers
@@ -119,10 +155,12 @@ async def _answer(app: ASGIApp, path: str, _: Any, context: Any) -> bytes:
             parts.append(answer.get("body", b""))
 
     try:
-        await app(_scope(path, context), receive, send)
+        await app(scope, receive, send)
     except Exception:
         if not parts:  # else the application has logged and answered it
-            logger.exception("unexpected error at %s", path)
+            logger.exception("unexpected error at %s", scope["path"])
+    if forward is not None and HANDED_OVER in scope:
+        return await forward(scope["path"], body, context, COUNTED in scope)
     trailing = tuple((name.decode(), value.decode("latin-1")) for name, value in headers if name in _TRAILING)
     if status == 200:
         context.set_trailing_metadata(trailing)
@@ -138,7 +176,7 @@ def _error(body: bytes) -> tuple[str, str]:
     return error.get("code", "internal_error"), error.get("message", UNEXPECTED_ERROR)
 
 
-def _scope(path: str, context: Any) -> Scope:
+def _scope(path: str, context: Any, peer: str) -> Scope:
     return {
         "type": "http",
         "asgi": {"version": "3.0", "spec_version": "2.3"},
@@ -150,7 +188,7 @@ def _scope(path: str, context: Any) -> Scope:
         "root_path": "",
         "query_string": b"",
         "headers": [(b"content-type", PROTOBUF), *_headers(context.invocation_metadata() or ())],
-        "client": _client(context.peer()),
+        "client": _client(peer),
         "server": None,
         "state": {},
         CALL: True,

@@ -119,6 +119,17 @@ async def _model_infer(state: State, scope: Scope, body: bytes) -> Reply:
     )
 
 
+async def _infer_at_once(state: State, scope: Scope, body: bytes) -> Reply | None:
+    """Answer a single query without waiting; return None for any other. Raise ServiceError for a wrong one."""
+    if len(body) > dataplane.MAX_INLINE_BYTES:
+        return None
+    sent = decode(InferRequest, body)
+    name, version = _model(scope, sent, "model_name", "model_version")
+    return dataplane.infer_at_once(
+        state.loaded, state.sequences, state.statistics, name, version, partial(Message, sent)
+    )
+
+
 def _document(name: str, document: dict[str, Any]) -> Reply:
     """Return the reply with a message of these fields; others are left out."""
     return encode(ParseDict(document, message(name)(), ignore_unknown_fields=True))
@@ -175,3 +186,5 @@ METHODS = {
         ("ModelStatistics", _model_statistics, READ),
     )
 }
+AT_ONCE = {f"/{SERVICE}/ServerLive": _server_live, f"/{SERVICE}/ModelInfer": _infer_at_once}
+"""What the data plane answers, by path: without waiting, or None to leave the call to the control plane."""

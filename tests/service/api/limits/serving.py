@@ -61,12 +61,22 @@ class SmallApp:
 
 
 class Serving:
-    """The server with limits, running during a `with` block."""
+    """The server with limits, running during a `with` block.
+
+    with_app: its application; unix: a listening Unix-domain socket instead of a port.
+    """
 
     def __init__(
-        self, notice_s: float = 0.0, drain_s: int = DRAIN_S, patience: ClientPatience = PATIENCE, **limits: Any
+        self,
+        notice_s: float = 0.0,
+        drain_s: int = DRAIN_S,
+        patience: ClientPatience = PATIENCE,
+        with_app: Any = None,
+        unix: socket.socket | None = None,
+        **limits: Any,
     ) -> None:
-        self.app, self.stopping, self.port = SmallApp(), StopState(), free_port()
+        self.app: Any = with_app or SmallApp()
+        self.stopping, self.port = StopState(), free_port()
         settings = Settings(**limits)
         config = uvicorn.Config(
             self.app,
@@ -76,9 +86,12 @@ class Serving:
             log_level="critical",
             timeout_keep_alive=settings.keep_alive_s,
             timeout_graceful_shutdown=drain_s,
+            server_header=False,
+            date_header=False,
         )
         self.server = Server(config, None, self.stopping, notice_s)
-        self.thread = threading.Thread(target=self.server.run, daemon=True)
+        sockets = None if unix is None else [unix]
+        self.thread = threading.Thread(target=self.server.run, args=(sockets,), daemon=True)
 
     def connect(self, data: bytes = b"") -> "RawConnection":
         """Return a new connection on which these bytes were sent."""
@@ -118,6 +131,13 @@ class RawConnection:
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), DEADLINE)
         self.ahead = b""  # bytes of the next answer
+
+    @classmethod
+    def of(cls, connected: socket.socket) -> "RawConnection":
+        """Return a connection over a socket."""
+        made = cls.__new__(cls)
+        made.socket, made.ahead = connected, b""
+        return made
 
     def send(self, data: bytes) -> None:
         """Send bytes."""

@@ -1,4 +1,4 @@
-"""Limits of connections: too many, silent, slow, never reading, endless."""
+"""Limits of connections: too many, silent, slow, never reading, endless; of one process and of two planes."""
 
 import time
 from contextlib import ExitStack, suppress
@@ -11,6 +11,7 @@ from service.api.limits.requests import ClientPatience
 from service.api.server.connections import MAX_REFUSED_CONNECTIONS, GuardedProtocol
 from tests.service.api.limits.serving import RawConnection, Serving, error_of
 from tests.service.data import DEADLINE, eventually
+from tests.service.planes.two_planes import TwoPlanes
 
 MiB = 1024 * 1024
 SOON = ClientPatience(header_s=1.0, answer_s=1.0)
@@ -24,17 +25,23 @@ END = b"0\r\n\r\n"
 HELLO = (200, b"hello")
 
 
+@pytest.fixture(scope="module", params=[Serving, TwoPlanes], ids=["one process", "two planes"])
+def serving_kind(request):
+    """The class of a server."""
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def impatient_server():
+def impatient_server(serving_kind):
     """A server whose limits are reached quickly."""
-    with Serving(patience=SOON, keep_alive_s=1) as serving:
+    with serving_kind(patience=SOON, keep_alive_s=1) as serving:
         yield serving
 
 
 @pytest.fixture(scope="module")
-def started_server():
+def started_server(serving_kind):
     """A patient server for two connections."""
-    with Serving(patience=ClientPatience(header_bytes=4096), max_connections=2) as serving:
+    with serving_kind(patience=ClientPatience(header_bytes=4096), max_connections=2) as serving:
         yield serving
 
 
@@ -203,8 +210,8 @@ def test_silent_connections_block_nobody(small_server):
         assert asking.ask(END) == (200, b"0")  # the pending request was not dropped
 
 
-def test_connection_without_a_request_is_dropped_first():
-    with Serving(max_connections=3) as serving, RawConnection(serving.port) as kept:
+def test_connection_without_a_request_is_dropped_first(serving_kind):
+    with serving_kind(max_connections=3) as serving, RawConnection(serving.port) as kept:
         assert kept.ask(GET) == HELLO
         with RawConnection(serving.port) as unread, RawConnection(serving.port) as silent:
             assert unread.ask(GET) == HELLO
@@ -217,9 +224,9 @@ def test_connection_without_a_request_is_dropped_first():
                     assert unread.ask(GET) == HELLO
 
 
-def test_connections_per_address_are_limited():
+def test_connections_per_address_are_limited(serving_kind):
     limits = {"max_connections": 100, "max_connections_per_client": 2}
-    direct = Serving(**limits, trusted_proxies="192.0.2.1")
+    direct = serving_kind(**limits, trusted_proxies="192.0.2.1")
     with direct as serving, RawConnection(serving.port) as first, RawConnection(serving.port) as second:
         occupy(serving, first, second)
         assert_refused(serving, GET, 429, "busy", "Too many connections from 127.0.0.1: at most 2 (")
@@ -229,14 +236,14 @@ def test_connections_per_address_are_limited():
             assert third.ask(GET) == HELLO
             assert first.read_to_end() == b""
     # a proxy's connection is exempt, as many clients share it
-    with Serving(**limits, trusted_proxies="127.0.0.0/8") as serving, ExitStack() as stack:
+    with serving_kind(**limits, trusted_proxies="127.0.0.0/8") as serving, ExitStack() as stack:
         for _ in range(4):
             assert stack.enter_context(RawConnection(serving.port)).ask(GET) == HELLO
         assert serving.connections == 4
 
 
-def test_streams_count_as_connections_of_their_address():
+def test_streams_count_as_connections_of_their_address(serving_kind):
     limits = {"max_connections_per_client": 1, "trusted_proxies": "192.0.2.1"}
-    with Serving(**limits) as serving, connect(f"ws://127.0.0.1:{serving.port}/") as stream:
+    with serving_kind(**limits) as serving, connect(f"ws://127.0.0.1:{serving.port}/") as stream:
         assert_refused(serving, GET, 429, "busy")
         assert_streams(stream)

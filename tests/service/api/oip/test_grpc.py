@@ -42,7 +42,11 @@ ROUTE = "/inference.GRPCInferenceService/ModelInfer"
 def calls(tmp_path_factory) -> Iterator[GrpcService]:
     settings = {"LIPSERVE_MAX_REQUEST_BYTES": str(MAX_BYTES), "LIPSERVE_LOG_FORMAT": "json"}
     # every rejection is logged
-    limits = {"service.app.PATIENCE": ClientPatience(body_s=BODY_S), "service.app.MAX_REFUSALS_PER_S": 1000}
+    limits: dict[str, object] = {}
+    for place in ("service.app", "service.planes.calls"):
+        limits[f"{place}.PATIENCE"] = ClientPatience(body_s=BODY_S)
+    for place in ("service.app", "service.planes.answers"):
+        limits[f"{place}.MAX_REFUSALS_PER_S"] = 1000
     with start_service(tmp_path_factory.mktemp("grpc") / "home", limits, **settings) as service:
         yield service
 

@@ -1,5 +1,6 @@
 """Sequences of the Open Inference Protocol: friction that remembers follows their queries from request to request."""
 
+import os
 from dataclasses import replace
 from threading import Thread
 
@@ -15,7 +16,7 @@ from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from service.api.oip import dataplane, sequences
-from service.api.oip.sequences import SequencePart, Sequences
+from service.api.oip.sequences import PLACES, SequencePart, Sequences, SharedStates
 from service.foundation.errors import InvalidRequestError
 from tests.lipcore.estimators.test_estimators import train_estimator
 from tests.service.api.oip.requests import (
@@ -313,3 +314,43 @@ def test_concurrent_requests_of_a_sequence_are_all_followed(table, api):
     for thread in threads:
         thread.join()
     assert results == [True] * 800
+
+
+def test_processes_share_a_sequence(api, model):
+    served, shared = service_of(api).loaded.get(NAME, 1), Sequences(SharedStates(max_joints=3))
+    motion, part = slow_motion(30), SequencePart("arm", False, False)
+    _, expected = expect(model, motion, PERIOD_S * np.arange(30))
+
+    def follow(row):
+        queries = np.stack([motion["q"][row : row + 1], motion["dq"][row : row + 1]])
+        return shared.follow(served, part, PERIOD_S * row, queries)
+
+    assert_array_equal(follow(0)[0], expected[0])
+    child = os.fork()
+    if not child:
+        for row in range(1, 20):
+            follow(row)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    for row in range(20, 30):
+        assert_array_equal(follow(row)[0], expected[row])
+
+
+def test_shared_sequence_replaces_the_one_that_is_silent_longest(api, model):
+    served, shared = service_of(api).loaded.get(NAME, 1), Sequences(SharedStates(max_joints=2, max_sequences=PLACES))
+
+    def follow(name, time, **ends):
+        motion = np.zeros((2, 1, 2))
+        motion[0] = 0.01 * time
+        found = shared.follow(served, SequencePart(name, False, False)._replace(**ends), time, motion)
+        return bool((found[0, 0] != 0.0).any())
+
+    names = [f"sequence {n}" for n in range(PLACES)]
+    for time, expected in ((100.0, False), (100.1, True)):
+        assert [follow(name, time + 1e-3 * n) for n, name in enumerate(names)] == [expected] * PLACES
+    assert not follow("another", 100.2)
+    assert [follow(name, 100.2) for name in names[1:]] == [True] * (PLACES - 1)
+    assert not follow(names[0], 100.21)
+    assert follow(names[2], 100.22, end=True)
+    assert not follow(names[2], 100.23)
+    assert not follow(names[3], 100.23, start=True)

@@ -1,0 +1,1 @@
+"""`lipserve doctor`: what this machine permits, and the loop rate that it holds."""

@@ -1,0 +1,174 @@
+"""The nursery: a process without threads, which forks companions, so that they share its imported modules.
+
+The control plane has threads and cannot fork. It forks the nursery before it starts them. See `Companion`.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection, wait
+from typing import Any
+from weakref import WeakSet
+
+from threadpoolctl import threadpool_limits
+
+from service.runtime import forking
+from service.runtime.process import ProcessOptions
+
+MAX_REQUEST_BYTES = 128 * 1024
+REPLY_S = 10.0
+"""Max wait for a reply of the nursery, s."""
+
+
+class NurseryError(OSError):
+    """The nursery has ended."""
+
+
+class Forked:
+    """A process that the nursery has forked; used like `multiprocessing.Process`."""
+
+    def __init__(self, nursery: Nursery, name: str, pid: int, handle: int) -> None:
+        self.name, self.pid = name, pid
+        self._nursery, self._handle = nursery, handle
+
+    def __del__(self) -> None:
+        os.close(self._handle)
+
+    @property
+    def exitcode(self) -> int | None:
+        """The exit code, negative for a signal; None while it runs, or if the nursery has ended."""
+        return None if self.is_alive() else self._nursery.exit_code(self.pid)
+
+    def is_alive(self) -> bool:
+        """Return whether it runs."""
+        return not wait([self._handle], 0)
+
+    def join(self, timeout: float | None = None) -> None:
+        """Wait for its end."""
+        wait([self._handle], timeout)
+
+    def kill(self) -> None:
+        """Kill it."""
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._handle, signal.SIGKILL)
+
+
+class Nursery:
+    """The nursery, as the process that has started it sees it. Safe from several threads."""
+
+    def __init__(self) -> None:
+        self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._ours.settimeout(REPLY_S)
+        self._lock, self._codes, self._forked = threading.Lock(), dict[int, int](), WeakSet[Forked]()
+
+        def work() -> None:
+            self._ours.close()
+            _tend(theirs)
+
+        self.pid = forking.fork(work, "nursery")
+        theirs.close()
+
+    def start(
+        self, name: str, place: ProcessOptions, connection: Connection, function: Callable[..., object], *given: Any
+    ) -> Forked:
+        """Fork a process that calls a function of a module with a connection and arguments. Raise OSError."""
+        request = pickle.dumps((name, place.threads, function, given))
+        with self._lock:
+            socket.send_fds(self._ours, [request], [connection.fileno()])
+            while True:
+                pid, handles = self._receive()
+                if handles:
+                    self._codes.pop(pid, None)  # of an earlier process with the same id
+                    forked = Forked(self, name, pid, handles[0])
+                    self._forked.add(forked)
+                    return forked
+
+    def running(self) -> list[Forked]:
+        """Return the processes that run."""
+        with self._lock:
+            return [each for each in self._forked if each.is_alive()]
+
+    def exit_code(self, pid: int) -> int | None:
+        """Return the exit code of an ended process."""
+        with self._lock, suppress(OSError):
+            while pid not in self._codes:
+                self._receive()
+        return self._codes.get(pid)
+
+    def _receive(self) -> tuple[int, list[int]]:
+        """Receive the id and the handle of a process that was forked; of one that has ended, keep the exit code."""
+        try:
+            data, handles, _, _ = socket.recv_fds(self._ours, 1024, 1)
+        except TimeoutError:
+            self._ours.close()  # a later reply would be taken for that to another request
+            raise
+        if not data:
+            raise NurseryError("the nursery process has ended")
+        pid, result = pickle.loads(data)  # noqa: S301 - of a process of this program
+        if isinstance(result, OSError):
+            raise result
+        if not handles:
+            self._codes[pid] = result
+        return pid, handles
+
+
+_nursery: Nursery | None = None
+
+
+def start() -> None:
+    """Fork the nursery of this process; call it before any thread starts."""
+    global _nursery  # noqa: PLW0603 - one a process
+    _nursery = Nursery()
+
+
+def current() -> Nursery | None:
+    """Return the nursery of this process, None if there is none."""
+    return _nursery
+
+
+def _tend(channel: socket.socket) -> None:
+    """Fork processes on request and report their exit codes, until the parent is gone."""
+    handles = dict[int, int]()
+    """Ids of the processes, by handle."""
+    while True:
+        for ready in wait([channel, *handles]):
+            if isinstance(ready, int):
+                pid = handles.pop(ready)
+                os.close(ready)
+                _, status = os.waitpid(pid, 0)
+                channel.send(pickle.dumps((pid, os.waitstatus_to_exitcode(status))))
+            elif not _answer(channel, handles):
+                return
+
+
+def _answer(channel: socket.socket, handles: dict[int, int]) -> bool:
+    """Fork the process that the next message requests; return False if the parent is gone."""
+    request, given, _, _ = socket.recv_fds(channel, MAX_REQUEST_BYTES, 1)
+    if not request:
+        return False
+    connection = Connection(given[0])
+    name, threads, function, arguments = pickle.loads(request)  # noqa: S301 - of the parent
+
+    def work() -> None:
+        channel.close()
+        for each in handles:
+            os.close(each)
+        threadpool_limits(threads)  # numerical libraries are imported, so environment variables come too late
+        function(*arguments, connection)
+
+    try:
+        pid = forking.fork(work, name)
+        handle = os.pidfd_open(pid)
+    except OSError as error:
+        channel.send(pickle.dumps((0, error)))
+    else:
+        handles[handle] = pid
+        socket.send_fds(channel, [pickle.dumps((pid, None))], [handle])
+    connection.close()
+    return True
