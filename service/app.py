@@ -150,7 +150,7 @@ def create_app(settings: Settings | None = None, shared: Shared | None = None) -
         app.include_router(router)
     dashboard.install(app)
     guide.install(app)
-    app.state.rules = Rules(app.routes)
+    app.state.rules, app.state.keyring = Rules(app.routes), keyring
     return app
 
 

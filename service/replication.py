@@ -184,7 +184,7 @@ def _point(learners: Learners, models: Collection[str] | None) -> None:
     """Update aliases from the database, and load their versions if the model is in use here."""
     loaded = learners.loaded
     used = {model for model, _ in loaded.versions()}
-    moved = registry.pointers(learners.database, models).items() - loaded.aliases().items()
+    moved = registry.pointers(learners.database, models).items() - loaded.snapshot.aliases.items()
     for (model, _), version in moved:
         if model in used:
             try:

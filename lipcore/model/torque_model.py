@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,6 +93,11 @@ class TorqueModel:
     """Conformal factors of the intervals; None for a model of an earlier release."""
     training_torque: TrainingTorque | None = None
     """Torque of the recording; None for a model of an earlier release."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle the fields and the evaluator if it is built: all other caches are cheap to compute again."""
+        kept = {*(each.name for each in fields(self)), "evaluator"}
+        return {name: value for name, value in vars(self).items() if name in kept}
 
     @property
     def n_joints(self) -> int:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +48,10 @@ class CompactPosterior(Posterior):
     """Additional variance of the torque."""
     statistics: Statistics | None = None
     """Statistics that the posterior was computed from, or None if they are more than one sum."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle the fields: caches are computed again if they are needed."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
     @classmethod
     def build(

@@ -32,6 +32,7 @@ class _Scratch(threading.local):
     """One thread's memory for a number of queries. It is created at the thread's first query."""
 
     def __init__(self, queries: int, samples: int, anchors: int, linear: int, n: int) -> None:
+        self._sizes = queries, samples, anchors, linear, n
         groups = -(-n // WIDTH)
         self.motions = np.zeros((queries, POSITIONS, n))
         self.deflected = np.zeros((queries, POSITIONS + 2 * len(ELEMENTS), n))
@@ -44,6 +45,10 @@ class _Scratch(threading.local):
         self.share = np.zeros((queries, n))
         # slicing would cost one query as much as the arithmetic
         self.work = self.blocks, self.features, self.prior, self.memory
+
+    def __reduce__(self) -> tuple[type[_Scratch], tuple[int, ...]]:
+        """Pickle the sizes alone."""
+        return _Scratch, self._sizes
 
 
 class Evaluator:

@@ -116,7 +116,7 @@ class Payloads:
                 out[stream_id] = StreamPayload(None, None, at)
             else:
                 model = self._answering(stream_id, held.estimate, carrier)
-                out[stream_id] = StreamPayload(model, held.estimate.mass, at, held.estimate.load)
+                out[stream_id] = StreamPayload(model, held.estimate.mass, at)
         return out
 
     def _answering(self, stream_id: str, estimate: Estimate, carrier: Carrier) -> TorqueModel:

@@ -6,61 +6,26 @@ import gc
 import itertools
 import logging
 import threading
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from weakref import WeakValueDictionary
 
-import numpy as np
-
-import lipcore
-from lipcore.data.samples import Array
-from lipcore.model.torque_model import TorqueModel
 from lipcore.online.transfer import Revision
 from service.contract.states import PartState
 from service.foundation.errors import NotFoundError, UnreadableVersionError
-from service.foundation.settings import Settings
 from service.models import registry
-from service.models.lineage import learnt_from
-from service.models.loads import StreamPayloads
+from service.models.changes import Changes
+from service.models.loading import VersionLoader, freeze_version, warmed
 from service.models.registry import SERVING, Serving
 from service.models.scales import Scales
 from service.models.served import Alias, Key, LearntStates, RevisionWaiters, ServedModel
+from service.models.snapshot import Snapshot
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
 
 logger = logging.getLogger(__name__)
 
 __all__ = ["LoadedModels", "ServedModel"]
-
-
-PRELOADED: dict[str, TorqueModel] = {}
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Versions in memory, the serving version of each model, and all other aliases; replaced as a whole."""
-
-    served: Mapping[Key, ServedModel] = field(default_factory=dict)
-    serving: Mapping[str, Serving] = field(default_factory=dict)
-    aliases: Mapping[Alias, int] = field(default_factory=dict)
-
-    def pointed(self, model: str, alias: str | None) -> int | None:
-        """Return the version of an alias, the serving version if `alias` is None.
-
-        Return None if this snapshot does not contain it.
-        """
-        if alias is None or alias == SERVING:
-            serving = self.serving.get(model)
-            return None if serving is None else serving.version
-        return self.aliases.get((model, alias))
-
-    def without(self, gone: set[Key], model: str | None) -> Snapshot:
-        """Return a copy without some versions and, if `model` is given, without that model's aliases."""
-        return Snapshot(
-            {key: each for key, each in self.served.items() if key not in gone},
-            {name: each for name, each in self.serving.items() if name != model},
-            {key: each for key, each in self.aliases.items() if key[0] != model},
-        )
 
 
 class LoadedModels:
@@ -72,11 +37,9 @@ class LoadedModels:
     """
 
     def __init__(self, storage: Storage, learnt: LearntStates, capacity: int | None = None) -> None:
-        self.storage, self.learnt = storage, learnt
+        self.storage, self.settings, self.learnt = storage, storage.settings, learnt
         self.database, self.files = storage.database, storage.files
         self.capacity = storage.settings.max_loaded_models if capacity is None else capacity
-        self.preloaded: Mapping[str, TorqueModel] = PRELOADED
-        """Versions that were loaded before this process was forked, by folder."""
         self.when_deleted: list[Callable[[str], None]] = []
         """Functions called with the name of a deleted model."""
         self._lagging: set[str] = set()
@@ -85,7 +48,8 @@ class LoadedModels:
         self._held: WeakValueDictionary[Key, ServedModel] = WeakValueDictionary()  # streams keep dropped versions
         self._revising = threading.Lock()
         self._snapshot = Snapshot(aliases=registry.pointers(storage.database))
-        self._deleted: set[Key] = set()
+        self.changes = Changes()  # of versions, revisions, aliases, width factors and payloads
+        self._loader = VersionLoader(self.database, self.files, learnt, self.changes.note)
         self._lock = threading.Lock()
         self.moving = threading.Lock()
         """Lock for moves of aliases and deletions of versions. Its holder changes the database, then this object."""
@@ -94,36 +58,29 @@ class LoadedModels:
         self._loading: dict[Key, threading.Lock] = {}
         self._clock = itertools.count()
         self._used: dict[Key, int] = {}
-        self._unreadable: dict[Key, str] = {}
-        self._scales: dict[Key, Scales] = {}
-        self._payloads: dict[Key, StreamPayloads] = {}
 
     @property
-    def settings(self) -> Settings:
-        """The settings of the service."""
-        return self.storage.settings
+    def snapshot(self) -> Snapshot:
+        """What answers now."""
+        return self._snapshot
 
     def hot(self, model: str, version: int | None, alias: str | None = None) -> ServedModel | None:
         """Return a version, or the version of an alias, if it is in memory; never waits.
 
         Without a version and an alias, or with the alias `serving`, return the serving version.
         """
-        snapshot = self._snapshot
-        if version is None:
-            version = snapshot.pointed(model, alias)
-            if version is None:
-                return None
-        key = (model, version)
-        served = snapshot.served.get(key)
-        if served is not None:
-            self._used[key] = next(self._clock)
+        if (served := self._snapshot.find(model, version, alias)) is not None:
+            self._used[served.name, served.version] = next(self._clock)
         return served
+
+    def note_use(self, keys: Iterable[Key]) -> None:
+        """Count uses of versions by another process, the last one last."""
+        served = self._snapshot.served
+        self._used.update((key, next(self._clock)) for key in keys if key in served)
 
     def peek(self, model: str) -> ServedModel | None:
         """Return the serving version if it is in memory; never waits. The call does not count as use."""
-        snapshot = self._snapshot
-        serving = snapshot.serving.get(model)
-        return None if serving is None else snapshot.served.get((model, serving.version))
+        return self._snapshot.find(model, None)
 
     def newest(self, model: str, alias: str | None = None) -> int | None:
         """Return the number of the version of an alias, or of the serving version, even if dropped; never waits."""
@@ -131,7 +88,7 @@ class LoadedModels:
 
     def is_deleted(self, model: str, version: int) -> bool:
         """Return whether a version was deleted since the service started; never waits."""
-        return (model, version) in self._deleted
+        return (model, version) in self._snapshot.deleted
 
     def get(self, model: str, version: int | None, alias: str | None = None) -> ServedModel:
         """Return a version, or the version of an alias; load it if necessary. Blocking: use it in a thread.
@@ -163,16 +120,8 @@ class LoadedModels:
     def point(self, model: str, alias: str, version: int | None) -> None:
         """Point an alias to a version, or to none. The caller holds `moving` and has changed the database."""
         with self._lock:
-            aliases = {**self._snapshot.aliases}
-            aliases.pop((model, alias), None)
-            if version is not None:
-                aliases[model, alias] = version
-            self._snapshot = replace(self._snapshot, aliases=aliases)
-        self.waiters.wake(model)
-
-    def aliases(self) -> Mapping[Alias, int]:
-        """Return the version of every alias except `serving`."""
-        return self._snapshot.aliases
+            self._snapshot = self._snapshot.with_alias(model, alias, version)
+        self._report_change((model,))
 
     def repoint(self, aliases: Mapping[Alias, int], models: Collection[str] | None) -> None:
         """Replace the aliases of these models, of all models if None.
@@ -180,10 +129,8 @@ class LoadedModels:
         The caller holds `moving` and has changed the database.
         """
         with self._lock:
-            kept = {} if models is None else {k: v for k, v in self._snapshot.aliases.items() if k[0] not in models}
-            self._snapshot = replace(self._snapshot, aliases=kept | dict(aliases))
-        for model in {model for model, _ in aliases}:
-            self.waiters.wake(model)
+            self._snapshot = self._snapshot.with_aliases(aliases, models)
+        self._report_change({model for model, _ in aliases})
 
     def forget(self, model: str, versions: Collection[int], entirely: bool = False) -> None:
         """Stop answering with deleted versions; the caller holds `moving`.
@@ -193,16 +140,13 @@ class LoadedModels:
         """
         gone = {(model, version) for version in versions}
         with self._revising, self._lock:
-            self._deleted |= gone
-            self._snapshot = self._snapshot.without(gone, model if entirely else None)
+            self._snapshot = self._snapshot.without_deleted(gone, model if entirely else None)
             for key in gone:
                 self._revisions.pop(key, None)
                 self._held.pop(key, None)
                 self._used.pop(key, None)
-                self._unreadable.pop(key, None)
-                self._scales.pop(key, None)
-                self._payloads.pop(key, None)
-        self.waiters.wake(model)
+            self._loader.forget(gone)
+        self._report_change((model,))
         if entirely:
             for deleted in self.when_deleted:
                 deleted(model)
@@ -226,7 +170,6 @@ class LoadedModels:
             self._adopt(model, serving)
 
     def _adopt(self, model: str, serving: Serving) -> bool:
-        """Load a version that serves; return whether that succeeded."""
         try:
             self._load(registry.find(self.database, model, serving.version), serving)
             return True
@@ -260,7 +203,7 @@ class LoadedModels:
 
     def unreadable(self) -> dict[Key, str]:
         """Return the versions that failed to load at their last use, and why."""
-        return dict(self._unreadable)
+        return self._loader.unreadable()
 
     def learn_from(self, wake: Callable[[str], None]) -> None:
         """Register the learner: `wake` is called with a model's name when a version is loaded that lags behind its log.
@@ -282,7 +225,7 @@ class LoadedModels:
         """
         key = (name, version)
         with self._revising:  # one at a time, so that the highest revision wins
-            if key in self._deleted:
+            if key in self._snapshot.deleted:
                 return False
             known = self._revisions.pop(key, None)
             if known is not None and known[0] >= revision:
@@ -293,17 +236,12 @@ class LoadedModels:
             known_version = self._snapshot.served.get(key) or self._held.get(key)
             if known_version is None or known_version.revision >= revision:
                 return False
-            served = replace(known_version, model=_warm(learnt.apply(known_version.base)), revision=revision)
+            served = replace(known_version, model=warmed(learnt.apply(known_version.base)), revision=revision)
             return self._publish(served) is served
 
     def scales(self, model: str) -> dict[int, Scales]:
         """Return the width factors of a model's versions, of those that were ever in memory."""
-        with self._lock:
-            return {version: scales for (name, version), scales in self._scales.items() if name == model}
-
-    def served(self, model: str) -> dict[int, ServedModel]:
-        """Return a model's versions that are in memory."""
-        return {version: each for (name, version), each in self._snapshot.served.items() if name == model}
+        return self._loader.scales(model)
 
     def preload(self) -> int:
         """Load the serving versions of the most recently changed models, as many as fit; return how many."""
@@ -318,70 +256,17 @@ class LoadedModels:
         with loading:  # a second request for the same version waits for the first, others do not
             served = self._snapshot.served.get(key)
             if served is None:
-                try:
-                    served = self._make(row)
-                except UnreadableVersionError as error:
-                    self._unreadable[key] = str(error)
-                    raise
-                self._unreadable.pop(key, None)
+                served, is_behind = self._loader.load(row, self._revisions.get(key))
+                if is_behind:
+                    self._wake(row.model)
             served = self._publish(served, serving)
             if (learnt := self._revisions.get(key)) is not None:  # published while this was loaded
                 self.revise(*key, *learnt)
                 served = self._snapshot.served.get(key, served)
-            # later garbage collections skip frozen objects: a scan of the version would stop all answers. A dropped
-            # version is still freed, because a model is in no reference cycle. Only a few hundred objects of current
-            # requests are frozen with it
-            gc.collect()
-            gc.freeze()
+            freeze_version()
             with self._lock:
                 self._loading.pop(key, None)
         return served
-
-    def _make(self, row: VersionRow) -> ServedModel:
-        base = self._read(row)
-        base.warm_up()
-        scales = self._scales_of(row, base.scale)
-        with self._lock:
-            payloads = self._payloads.setdefault((row.model, row.version), StreamPayloads())
-        served = ServedModel(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales, payloads)
-        if served.carrier is not None and payloads.fresh:
-            served.carrier.warm_up()
-            payloads.replace(self.learnt.payloads(row.model, row.version, served.carrier))
-        if (published := self._revisions.get((row.model, row.version))) is not None:
-            revision, learnt = published
-            return replace(served, model=_warm(learnt.apply(base)), revision=revision)
-        try:
-            known = self.learnt.find(row.model, row.version, base)
-        except Exception:  # queries are answered by the version as trained; the reply states its revision
-            logger.exception(
-                "could not read what version %d of model %r has learnt; serving it as trained",
-                row.version,
-                row.model,
-            )
-            return served
-        if known is None:
-            return served
-        if known.behind:
-            self._wake(row.model)
-        return replace(served, model=_warm(known.model), revision=known.revision)
-
-    def _scales_of(self, row: VersionRow, own: Array) -> Scales:
-        """Return the version's width factors as of its last use, or as of the last run of the service."""
-        key = (row.model, row.version)
-        if (known := self._scales.get(key)) is not None:
-            return known
-        scales = Scales(own)
-        scales.replace(self.learnt.factors(*key))
-        with self._lock:
-            return self._scales.setdefault(key, scales)
-
-    def _read(self, row: VersionRow) -> TorqueModel:
-        try:
-            return self.preloaded.get(row.folder) or self.files.load_version(row.folder, row.checksums)
-        except lipcore.ModelFormatError as error:
-            registry.find(self.database, row.model, row.version)  # it may have been deleted meanwhile
-            message = f"version {row.version} of model {row.model!r} cannot be loaded: {error}"
-            raise UnreadableVersionError(message) from error
 
     def _publish(self, served: ServedModel, serving: Serving | None = None) -> ServedModel:
         """Answer with a version from now on and return the version that answers.
@@ -390,28 +275,26 @@ class LoadedModels:
         """
         key = (served.name, served.version)
         with self._lock:
-            if key in self._deleted:  # deleted while it was loaded: only earlier requests get it
+            if key in self._snapshot.deleted:  # deleted while it was loaded: only earlier requests get it
                 return served
             if key not in self._used:  # a new revision of a loaded version does not count as use
                 self._used[key] = next(self._clock)
-            entries, pointers = dict(self._snapshot.served), dict(self._snapshot.serving)
-            current = entries.get(key)
-            if current is None or current.revision < served.revision:
-                entries[key] = self._held[key] = current = served
+            snapshot = self._snapshot.with_version(served)
+            current = snapshot.served[key]
+            if current is served:
+                self._held[key] = served
             if serving is not None:
                 self._used[key] = next(self._clock)
-                known = pointers.get(served.name)
-                pointers[served.name] = serving if known is None or serving.change > known.change else known
-            while len(entries) > self.capacity:
-                oldest = min(entries, key=lambda each: self._used.get(each, -1))
-                del entries[oldest]
+                snapshot = snapshot.with_serving(served.name, serving)
+            dropped = sorted(snapshot.served, key=lambda each: self._used.get(each, -1))[: -self.capacity]
+            for oldest in dropped:
                 self._used.pop(oldest, None)
-            self._snapshot = replace(self._snapshot, served=entries, serving=pointers)
-        self.waiters.wake(served.name)
+            self._snapshot = snapshot.without(dropped)
+        self._report_change((served.name,))
         return current
 
-
-def _warm(model: TorqueModel) -> TorqueModel:
-    """Return the model after one prediction, which loads its arrays into memory."""
-    model.answer(np.zeros((3, model.n_joints)))
-    return model
+    def _report_change(self, models: Iterable[str]) -> None:
+        """Wake those that wait for a change of these models, and those that publish what answers."""
+        for model in models:
+            self.waiters.wake(model)
+        self.changes.note()

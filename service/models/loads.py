@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from lipcore.model.payload import PayloadPosterior
 from lipcore.model.torque_model import TorqueModel
 from service.models.scales import RECENT_S
 
@@ -20,19 +19,20 @@ class StreamPayload:
     """Mean and standard deviation, kg; None if the stream has no payload."""
     received: float
     """Unix time of the stream's last observation batch, s."""
-    load: PayloadPosterior | None = None
-    """Payload that the model has, for another process that builds it."""
 
 
 class StreamPayloads:
     """Payload models of a version's streams; any thread may read while one thread replaces them.
 
-    A version keeps one instance as long as the service runs, as it does its `Scales`.
+    A version keeps one instance as long as the service runs, as it does its `Scales`. changed: called after each
+    replacement.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, changed: Callable[[], None] | None = None) -> None:
+        self._changed = changed
         self._streams: Mapping[str, StreamPayload] = {}
         self._default: StreamPayload | None = None
+        self._given: Mapping[str, StreamPayload] = {}
         self.default_model: TorqueModel | None = None
         """Model for queries without a stream: with the payload declared for all, or that of the only recent stream.
         None means the version without payload.
@@ -59,6 +59,10 @@ class StreamPayloads:
         """Return the payload mass of every stream that has reported one, as `mass` does."""
         return {name: each.mass for name, each in self._streams.items()}
 
+    def streams(self) -> Mapping[str, StreamPayload]:
+        """Return the payloads of all streams, as `replace` was given them."""
+        return self._given
+
     def replace(self, streams: Mapping[str, StreamPayload]) -> None:
         """Replace the payloads of all streams; the empty name is the default for other streams."""
         self._default = streams.get("")
@@ -68,4 +72,6 @@ class StreamPayloads:
         default = None if self._default is None else self._default.model
         self.default_model = recent[0].model if len(recent) == 1 else default
         self.fresh = False
-        self._streams = known
+        self._streams, self._given = known, streams
+        if self._changed is not None:
+            self._changed()

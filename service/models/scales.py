@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from lipcore.data.samples import Array
@@ -32,11 +32,11 @@ class Scales:
     """Current width factors of a version; any thread may read while one thread replaces them.
 
     A version keeps one instance as long as the service runs; all of its revisions share it. `own` (n,) are the factors
-    from the training, used until streams have their own.
+    from the training, used until streams have their own. changed: called after each replacement.
     """
 
-    def __init__(self, own: Array) -> None:
-        self._own = own
+    def __init__(self, own: Array, changed: Callable[[], None] | None = None) -> None:
+        self._own, self._changed = own, changed
         self._streams: Mapping[str, Factor] = {}
         self._widest = own
         self.default_factors: list[float] = own.tolist()
@@ -53,6 +53,10 @@ class Scales:
         known = self._streams.get(stream_id)
         return self._own if known is None else known.values
 
+    def streams(self) -> Mapping[str, Factor]:
+        """Return the factors of all streams."""
+        return self._streams
+
     def replace(self, streams: Mapping[str, Factor]) -> None:
         """Replace the factors of all streams."""
         trusted = [each for each in streams.values() if not each.doubted]
@@ -61,3 +65,5 @@ class Scales:
         self._widest = widest(recent, self._own)
         self.default_factors = self._widest.tolist()
         self._streams = streams
+        if self._changed is not None:
+            self._changed()

@@ -1,25 +1,81 @@
 """Messages between the planes, over a Unix socket that keeps their bounds (SOCK_SEQPACKET).
 
-A message is a pickled object; both ends are processes of one service. Large arrays travel in a file in memory, which
-the receiver maps: it copies nothing and needs no interpreter lock for it.
+A message is a pickled object; both ends are processes of one service. Large messages and their arrays travel in a file
+in memory, which every receiver maps: it copies nothing, and the pages are shared.
 """
 
 from __future__ import annotations
 
-import mmap
+import logging
 import os
 import pickle
 import socket
+import struct
+from array import array
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
+from service.planes.pages import map_file
+
+logger = logging.getLogger(__name__)
+
 MAX_MESSAGE_BYTES = 160 * 1024
-"""Max bytes of a message without its arrays: below the default send buffer of Linux, 208 KiB."""
+"""Max bytes of a message without its file: below the default send buffer of Linux, 208 KiB."""
 MIN_SHARED_BYTES = 32 * 1024
-"""Bytes of arrays from which on they travel in a file in memory."""
+"""Bytes from which on a message and its arrays travel in a file in memory."""
+MAX_FDS = 4
+"""Max file descriptors of a message, with that of its file."""
+_FD = struct.Struct("i")
+_HEAD = struct.Struct("<I?")
+"""Size of the pickled places, and whether the message has a file. A header without a size is that of no message."""
+
+
+@dataclass
+class Package:
+    """A message ready to be sent, to several receivers if necessary. Close it afterwards."""
+
+    places: list[tuple[int, int]]
+    """Begin and size of each array in the file, of the message itself first."""
+    data: bytes
+    """The message, unless it is in the file."""
+    file: int | None
+    """Descriptor of the file in memory; None for a small message."""
+
+    @classmethod
+    def of(cls, message: Any) -> Package:
+        """Pickle a message."""
+        buffers = list[pickle.PickleBuffer]()
+        data = pickle.dumps(message, 5, buffer_callback=buffers.append)
+        views = [each.raw() for each in buffers]
+        size = len(data) + sum(each.nbytes for each in views)
+        if size < MIN_SHARED_BYTES:
+            return cls([], pickle.dumps(message, 5) if views else data, None)
+        parts = [memoryview(data), *views]
+        ends = [0, *accumulate(-(-each.nbytes // 64) * 64 for each in parts)]  # aligned like NumPy's own arrays
+        file = os.memfd_create("lipserve", os.MFD_CLOEXEC)
+        try:
+            os.ftruncate(file, ends[-1])
+            for part, at in zip(parts, ends, strict=False):
+                _write(file, part, at)
+        except BaseException:
+            os.close(file)
+            raise
+        return cls([(at, each.nbytes) for at, each in zip(ends, parts, strict=False)], b"", file)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the message with its arrays."""
+        return len(self.data) if self.file is None else sum(self.places[-1])
+
+    def close(self) -> None:
+        """Close the file; receivers keep their mappings."""
+        if self.file is not None:
+            os.close(self.file)
+            self.file = None
 
 
 class Channel:
@@ -27,6 +83,11 @@ class Channel:
 
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
+
+    def limit_wait(self, seconds: float) -> None:
+        """Limit the time that `send` waits for room if the other end hangs."""
+        limit = struct.pack("ll", int(seconds), int(1e6 * (seconds % 1)))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
 
     @classmethod
     def connect(cls, path: Path) -> Channel:
@@ -44,51 +105,71 @@ class Channel:
 
         wait: whether to wait for room. False is for an event loop: the other end may hang.
         """
-        buffers: list[pickle.PickleBuffer] = []
-        data = pickle.dumps(message, 5, buffer_callback=buffers.append)
-        views = [each.raw() for each in buffers]
-        size, shared, ends = sum(each.nbytes for each in views), -1, list[int]()
-        if 0 < size < MIN_SHARED_BYTES:
-            data = pickle.dumps(message, 5)
-        elif size:
-            ends = [0, *accumulate(-(-each.nbytes // 64) * 64 for each in views)]
-            shared = os.memfd_create("lipserve", os.MFD_CLOEXEC)
-            for view, at in zip(views, ends, strict=False):
-                os.pwrite(shared, view, at)
-            os.ftruncate(shared, ends[-1])
-        spans = [(at, each.nbytes) for at, each in zip(ends, views, strict=False)]
-        given = [*fds, *([shared] if shared >= 0 else [])]
+        package = message if isinstance(message, Package) else Package.of(message)
+        places, given = pickle.dumps(package.places, 5), list(fds)
+        if package.file is not None:
+            given.append(package.file)
+        parts = [_HEAD.pack(len(places), package.file is not None), places, package.data]
         try:
-            header = pickle.dumps((spans, len(fds)), 5)
-            parts = [len(header).to_bytes(2, "little"), header, data]
-            socket.send_fds(self._socket, parts, given, 0 if wait else socket.MSG_DONTWAIT)
+            # not `socket.send_fds`: it ignores flags, and would wait
+            rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array("i", given))] if given else []
+            self._socket.sendmsg(parts, rights, 0 if wait else socket.MSG_DONTWAIT)
         except OSError:
             return False
         finally:
-            if shared >= 0:
-                os.close(shared)
+            if package is not message:
+                package.close()
         return True
 
     def receive(self) -> tuple[Any, list[int]] | None:
-        """Wait for a message; return it with its file descriptors, None if the other end is gone."""
+        """Wait for a message; return it with its file descriptors. Return None if the other end is gone.
+
+        A message that cannot be read ends the connection: both ends connect again and begin anew.
+        """
         try:
-            data, fds, _, _ = socket.recv_fds(self._socket, MAX_MESSAGE_BYTES, 4)
+            # not `socket.recv_fds`: it ignores flags, and a started process would inherit the descriptors
+            data, rest, flags, _ = self._socket.recvmsg(
+                MAX_MESSAGE_BYTES, socket.CMSG_LEN(MAX_FDS * _FD.size), socket.MSG_CMSG_CLOEXEC
+            )
         except OSError:
             return None
-        if not data:
+        fds = [fd for *_, part in rest for (fd,) in _FD.iter_unpack(part[: len(part) // _FD.size * _FD.size])]
+        try:
+            if not data:
+                raise EOFError
+            if flags & (socket.MSG_TRUNC | socket.MSG_CTRUNC):
+                raise ValueError("the message is larger than the limit")
+            return _read(data, fds), fds
+        except Exception as error:
+            for fd in fds:
+                os.close(fd)
+            if data:
+                logger.error("a message of another process of this service cannot be read: %s", error)
             return None
-        start = 2 + int.from_bytes(data[:2], "little")
-        spans, count = pickle.loads(data[2:start])  # noqa: S301 - from a process of this service
-        buffers: list[memoryview] = []
-        if spans:
-            # private and writable, as other arrays are: pages stay shared because nobody writes
-            content = memoryview(mmap.mmap(fds[count], 0, mmap.MAP_PRIVATE))
-            os.close(fds[count])
-            buffers = [content[at : at + size] for at, size in spans]
-        return pickle.loads(data[start:], buffers=buffers), fds[:count]  # noqa: S301 - as above
 
     def close(self) -> None:
         """Close it; a thread that receives gets None."""
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
+
+
+def _read(data: bytes, fds: list[int]) -> Any:
+    """Return the message in these bytes, and remove the descriptor of its file."""
+    size, has_file = _HEAD.unpack_from(data)
+    places = pickle.loads(data[_HEAD.size : _HEAD.size + size])  # noqa: S301 - from a process of this service
+    if not has_file:
+        return pickle.loads(data[_HEAD.size + size :])  # noqa: S301 - as above
+    file = fds.pop()
+    try:
+        content = map_file(file, sum(places[-1]))
+    finally:
+        os.close(file)
+    message, *buffers = (content[at : at + length] for at, length in places)
+    return pickle.loads(message, buffers=buffers)  # noqa: S301 - as above
+
+
+def _write(file: int, part: memoryview, at: int) -> None:
+    done = 0
+    while done < part.nbytes:
+        done += os.pwrite(file, part[done:], at + done)

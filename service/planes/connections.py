@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import re
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from service.api.limits.requests import COUNTED, HEALTH
@@ -16,7 +18,8 @@ CONNECTION = "lipserve.http_connection"
 """Key of the connection in the ASGI scope of a request that the data plane may hand over."""
 _REQUEST = "lipserve.stream_request"
 """Key of the bytes of a stream's request, and its client as in `LimitedConnection`, in the state of its connection."""
-_HEALTH_REQUESTS = (f"GET {HEALTH}".encode(), f"HEAD {HEALTH}".encode())
+_HEALTH_REQUEST = re.compile(rb"[A-Z]+ " + HEALTH.encode())
+"""The start of a request that is answered on connections beyond the limit, too."""
 
 
 class DataProtocol(GuardedProtocol):
@@ -61,7 +64,8 @@ class DataProtocol(GuardedProtocol):
         if self._handed is not None:
             if self._handed.refused:
                 self.refuse_requests(self._handed.refused)
-            self._read(self._handed.read)
+            data, self._handed = self._handed.read, None  # frees memory
+            self._read(data)
 
     def data_received(self, data: bytes) -> None:
         """Handle bytes from the socket; those that come during an answer wait."""
@@ -83,7 +87,7 @@ class DataProtocol(GuardedProtocol):
             self._part = data
             self._unset_keepalive_if_required()
             self._watch_head()
-        elif size == OTHER and self.refused and not data.startswith(_HEALTH_REQUESTS):
+        elif size == OTHER and self.refused and not _HEALTH_REQUEST.match(data):
             super().data_received(data)
         elif size == OTHER:
             self._query = data
@@ -206,7 +210,8 @@ class ControlProtocol(GuardedProtocol):
         super().connection_made(transport)
         if self._handed.refused:
             self.refuse_requests(self._handed.refused)
-        super().data_received(self._handed.read)
+        data, self._handed = self._handed.read, replace(self._handed, data=b"")  # frees memory
+        super().data_received(data)
 
     def data_received(self, data: bytes) -> None:
         """Handle bytes from the socket; pass the connection back at the start of a query."""

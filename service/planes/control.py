@@ -18,6 +18,7 @@ from service.api.server.configuration import configure_server
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.planes.channel import Channel
+from service.planes.confirmations import confirm_answers
 from service.planes.dataplanes import DataPlanes
 from service.planes.inheritance import CONTROL_PART, Inheritance
 from service.planes.pulse import BEAT_S, Plane, Pulse
@@ -32,6 +33,7 @@ def run(inherited: Inheritance) -> None:
     multiprocessing.current_process().name = "MainProcess"  # the log does not mention it
     limit_free_memory()
     app = create_app(inherited.settings, inherited.memory.join(CONTROL_PART))
+    confirm_answers(app)
     ControlServer(app, inherited.settings, inherited.accepting, inherited.pulse).run()
 
 

@@ -12,14 +12,13 @@ from fastapi import FastAPI
 from uvicorn.server import Server
 
 from service.api.server.connections import guarded
-from service.foundation.errors import ServiceError
 from service.learning.learners import Learners
-from service.models.loaded import LoadedModels
 from service.planes.channel import Channel
 from service.planes.connections import ControlProtocol
 from service.planes.counting import AdoptedConnections, ShedConnection
-from service.planes.frames import FramesToLog, log_frames
+from service.planes.frames import FramesLogged, FramesToLog, log_frames
 from service.planes.handover import Handed, adopt, pass_on
+from service.planes.publications import Answering, Confirmed, Holdings, LoadRequest, VersionUse
 from service.planes.publisher import Publisher
 
 logger = logging.getLogger(__name__)
@@ -40,16 +39,19 @@ class DataPlanes:
             kind, config=server.config, server_state=server.server_state, app_state=server.lifespan.state
         )
         self._connections = AdoptedConnections(kind.limit, server.server_state.connections, self._broadcast)
+        self._publisher = Publisher(app.state.loaded, app.state.keyring, app.state.confirmations)
+        app.state.confirmations.start(app.state.loaded.changes)
+        self._publisher.start()
         self._reporting = self._loop.create_task(self._connections.report())
 
     def add(self, channel: Channel) -> None:
         """Publish to a data plane and do what it asks for, until it is gone. From any thread."""
         self._loop.call_soon_threadsafe(self._join, channel)
-        Publisher(self._app, channel).start()
         threading.Thread(target=self._receive, args=(channel,), daemon=True, name="data plane").start()
 
     def close(self) -> None:
-        """Stop reporting, and close the channels."""
+        """Stop publishing and reporting, and close the channels."""
+        self._publisher.close()
         self._reporting.cancel()
         for channel in tuple(self._channels):
             channel.close()
@@ -60,6 +62,7 @@ class DataPlanes:
                 self._handle(channel, *received)
             except Exception:
                 logger.exception("could not handle a message of the data plane")
+        self._publisher.unsubscribe(channel)
         self._loop.call_soon_threadsafe(self._leave, channel)
 
     def _join(self, channel: Channel) -> None:
@@ -78,11 +81,13 @@ class DataPlanes:
             case Handed():
                 asyncio.run_coroutine_threadsafe(self._adopt(channel, message, fds[0]), self._loop)
             case FramesToLog():
-                asyncio.run_coroutine_threadsafe(_log(learners, channel, message), self._loop)
+                asyncio.run_coroutine_threadsafe(self._log(learners, channel, message), self._loop)
             case ShedConnection():
                 self._loop.call_soon_threadsafe(self._shed, channel, message)
-            case ("load", model, version, alias):
-                threading.Thread(target=_load, args=(learners.loaded, model, version, alias), daemon=True).start()
+            case Holdings():
+                self._publisher.subscribe(channel, message)
+            case Answering() | Confirmed() | LoadRequest() | VersionUse():
+                self._publisher.receive(channel, message)
             case ("meters", given):
                 self._app.state.data_meters = given
 
@@ -104,14 +109,11 @@ class DataPlanes:
         for channel in tuple(self._channels):
             channel.send(message, wait=False)
 
+    async def _log(self, learners: Learners, channel: Channel, message: FramesToLog) -> None:
+        """Log frames; acknowledge them after the publication of what they have changed."""
+        logged = await log_frames(learners, message)
+        await asyncio.to_thread(self._publish_and_send, channel, logged)
 
-def _load(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> None:
-    try:
-        loaded.get(model, version, alias)
-    except ServiceError:
-        logger.debug("model %s cannot be loaded for the data plane", model)
-
-
-async def _log(learners: Learners, channel: Channel, message: FramesToLog) -> None:
-    logged = await log_frames(learners, message)
-    await asyncio.to_thread(channel.send, logged)
+    def _publish_and_send(self, channel: Channel, message: FramesLogged) -> None:
+        self._publisher.publish()
+        channel.send(message)

@@ -19,12 +19,15 @@ from service.planes.channel import Channel
 from service.planes.counting import ConnectionReport, ConnectionShed, PassedConnections
 from service.planes.frames import FramesLogged, RemoteLearners
 from service.planes.handover import Handed, adopt, pass_on
+from service.planes.publications import KeysRead
 from service.planes.published import PublishedModels
 from service.runtime.realtime import PRIORITY, enter_real_time
 
 logger = logging.getLogger(__name__)
 RECONNECT_S = 0.05
 """Pause between two tries to connect, s."""
+REPORT_S = 1.0
+"""Seconds between two reports of the versions that are used, and two checks of the keys of streams."""
 
 
 class ControlLink:
@@ -36,8 +39,8 @@ class ControlLink:
 
     def __init__(self, settings: Settings, path: Path, keyring: Keyring | None) -> None:
         self.settings, self.keyring = settings, keyring
-        self.loaded = PublishedModels(settings, self._request)
-        self.published = threading.Event()
+        self.loaded = PublishedModels(settings, self._send_at_once)
+        self.published = self.loaded.ready
         self.learners = RemoteLearners(settings, self.loaded, self._send_at_once)
         self.passed = PassedConnections(self._send_at_once)
         self._path, self._closed = path, False
@@ -50,6 +53,21 @@ class ControlLink:
         """Begin to answer, in the running event loop. protocol: returns a `DataProtocol`; its argument is `handed`."""
         self._protocol = protocol
         self._loop = asyncio.get_running_loop()
+        self.loaded.begin_answering()
+        self._report()
+
+    def _report(self) -> None:
+        """Report each second which versions are used, and end the streams of invalid keys."""
+        self.loaded.report_use()
+        if self.keyring is not None:
+            self.keyring.end_lasting()
+        assert self._loop is not None
+        self._loop.call_later(REPORT_S, self._report)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a control plane."""
+        return self._channel is not None
 
     def close(self) -> None:
         """Close the channel for good."""
@@ -69,9 +87,6 @@ class ControlLink:
         message = Handed(handed.data, handed.counted, handed.refused, number)
         return self._send(message, [fd], wait=False)
 
-    def _request(self, model: str, version: int | None, alias: str | None) -> None:
-        self._send(("load", model, version, alias))
-
     def _send_at_once(self, message: Any) -> bool:
         return self._send(message, wait=False)
 
@@ -88,13 +103,13 @@ class ControlLink:
             except OSError:
                 time.sleep(RECONNECT_S)
                 continue
-            for model in self.loaded.held():
-                channel.send(("load", model, None, None))
+            channel.send(self.loaded.holdings())
             while (received := channel.receive()) is not None:
                 try:
                     self._handle(*received)
                 except Exception:
-                    logger.exception("could not apply a publication")
+                    logger.exception("could not apply a publication; the data plane connects again")
+                    break
             self._channel = None
             channel.close()
             self._on_loop(self.learners.resend)
@@ -110,12 +125,9 @@ class ControlLink:
                 self._on_loop(self.passed.update, message)
             case ConnectionShed():
                 self._on_loop(self.passed.receive, message)
-            case ("published",):
-                self.published.set()
-            case ("keys", keys) if self.keyring is not None:
-                self.keyring._update_keys(keys)
-                self._on_loop(self.keyring._end_lasting)
-                self.published.set()
+            case KeysRead(keys) if self.keyring is not None:
+                self.keyring.update(keys)
+                self._on_loop(self.keyring.end_lasting)
             case _:
                 began = time.perf_counter()
                 self.loaded.apply(message)

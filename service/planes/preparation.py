@@ -12,7 +12,7 @@ from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.models import registry
-from service.models.loaded import PRELOADED
+from service.models.loading import PRELOADED
 from service.storage.database import Database
 from service.storage.files import Files
 

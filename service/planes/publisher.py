@@ -1,101 +1,183 @@
-"""Publishes what answers to the data plane, from the control plane."""
+"""Publishes what answers to the data planes, from the control plane."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack
+from math import inf
 from typing import Any
 
-from fastapi import FastAPI
-
-from lipcore.online.transfer import Revision
-from service.api.access.keys import list_keys
-from service.models import registry
+from service.api.access.keys import Keyring
+from service.foundation.errors import NotFoundError, ServiceError
 from service.models.loaded import LoadedModels
-from service.models.served import Key
-from service.planes.channel import Channel
-from service.planes.publications import NewRevision, Pointers, StreamState, Version
-from service.storage.database import ApiKeyRow
+from service.planes.channel import Channel, Package
+from service.planes.confirmations import Confirmations
+from service.planes.publications import (
+    Answering,
+    Confirmed,
+    Holdings,
+    KeysRead,
+    LoadRequest,
+    NewPayload,
+    NewRevision,
+    NewVersion,
+    NotLoaded,
+    Published,
+    VersionUse,
+)
+from service.planes.stream_states import PayloadNumbers
+from service.planes.subscriber import Subscriber
 
 logger = logging.getLogger(__name__)
-PUBLISH_S = 0.02
-"""Seconds between two looks for changes. The real one is woken by them."""
-
-
-@dataclass
-class Sent:
-    """What a data plane has been sent."""
-
-    revisions: dict[Key, int] = field(default_factory=dict)
-    factors: dict[Key, object] = field(default_factory=dict)
-    payloads: dict[Key, object] = field(default_factory=dict)
-    pointers: Pointers | None = None
-    keys: object = None
+PATIENCE_S = 2.0
+"""Max seconds that a message waits for room in a socket. A data plane that takes longer has to connect again."""
 
 
 class Publisher:
-    """Sends what answers to one data plane, in a thread, until that is gone."""
+    """Tells all data planes what answers. A thread does so after each change; safe to share between threads.
 
-    def __init__(self, app: FastAPI, channel: Channel) -> None:
-        self.app, self.channel = app, channel
+    confirmations: receives the numbers of the publications that the data plane which answers has applied.
+    """
+
+    def __init__(self, loaded: LoadedModels, keyring: Keyring | None, confirmations: Confirmations) -> None:
+        self._loaded, self._keyring, self._confirmations = loaded, keyring, confirmations
+        self._subscribers: dict[Channel, Subscriber] = {}
+        self._numbers = PayloadNumbers()
+        self._lock, self._closed = threading.Lock(), False
+        if keyring is not None:
+            keyring.when_changed.append(loaded.changes.note)
 
     def start(self) -> None:
         """Begin to publish."""
         threading.Thread(target=self._run, daemon=True, name="publisher").start()
 
+    def close(self) -> None:
+        """Stop publishing."""
+        self._closed = True
+        self._loaded.changes.note()
+
     def _run(self) -> None:
-        """Send changes until the data plane is gone."""
-        sent, woken = Sent(), threading.Event()
+        published = -1
+        while not self._closed:
+            self._loaded.changes.wait(published)
+            published = self.publish()
+
+    def publish(self) -> int:
+        """Send every data plane what it lacks; return the number of changes that they now know."""
+        with self._lock:
+            number = self._loaded.changes.number  # before what it counts: a later change is published again
+            with ExitStack() as closing:
+                packages = dict[Any, Package]()
+                for subscriber in tuple(self._subscribers.values()):
+                    if not subscriber.can_follow(number):
+                        continue
+                    try:
+                        sent = self._send_changes(subscriber, number, packages, closing)
+                    except Exception:
+                        logger.exception("could not publish to a data plane")
+                        sent = False
+                    if not sent:
+                        self._subscribers.pop(subscriber.channel)
+                        subscriber.channel.close()
+                self._report()
+            self._numbers.keep(self._loaded.snapshot.served.values())
+        return number
+
+    def _send_changes(
+        self, subscriber: Subscriber, number: int, packages: dict[Any, Package], closing: ExitStack
+    ) -> bool:
+        """Send a data plane what it lacks; return whether it can be reached. packages: of large messages, for all."""
+        channel = subscriber.channel
+        for message in subscriber.changes(self._loaded.snapshot, self._numbers, number):
+            if (name := _name_of(message)) is None:
+                sent = channel.send(message)
+            else:
+                if name not in packages:
+                    packages[name] = Package.of(message)
+                    closing.callback(packages[name].close)
+                sent = channel.send(packages[name])
+            if not sent:
+                return False
+        if self._keyring is not None and subscriber.keys is not (keys := self._keyring.records):
+            subscriber.keys = keys
+            channel.send(KeysRead(keys))
+        subscriber.note_published(number)
+        return channel.send(Published(number))
+
+    def subscribe(self, channel: Channel, holdings: Holdings) -> None:
+        """Publish to a data plane from now on, and load what it answers with, in a thread."""
+        subscriber = Subscriber(channel, holdings)
+        channel.limit_wait(PATIENCE_S)
+        with self._lock:
+            self._subscribers[channel] = subscriber
+            self._report()
+        self._loaded.changes.note()
+        if not subscriber.is_complete:
+            threading.Thread(target=self._complete, args=(subscriber, holdings), daemon=True).start()
+
+    def unsubscribe(self, channel: Channel) -> None:
+        """Stop publishing to a data plane that is gone."""
+        with self._lock:
+            self._subscribers.pop(channel, None)
+            self._report()
+
+    def receive(self, channel: Channel, message: Answering | Confirmed | LoadRequest | VersionUse) -> None:
+        """Act on a message of a data plane; load a version in a thread."""
+        subscriber = self._subscribers.get(channel)
+        match message:
+            case LoadRequest():
+                threading.Thread(target=self._load, args=(channel, message), daemon=True).start()
+            case _ if subscriber is None:
+                pass
+            case Confirmed(number):
+                subscriber.confirm(number)
+                self._report()
+                if subscriber.lags(self._loaded.changes.number):
+                    self._loaded.changes.note()  # it had to wait
+            case Answering():
+                subscriber.answers = True
+                self._report()
+            case VersionUse(used):
+                self._loaded.note_use(used)
+                subscriber.release(message)
+
+    def _load(self, channel: Channel, request: LoadRequest) -> None:
         try:
-            while self._send_changes(self.channel, sent):
-                woken.wait(PUBLISH_S)
-        except Exception:
-            logger.exception("could not publish to the data plane")
-            self.channel.close()
+            self._loaded.get(request.model, request.version, request.alias)
+        except ServiceError:
+            channel.send(NotLoaded(request))
 
-    def _send_changes(self, channel: Channel, sent: Sent) -> bool:
-        loaded: LoadedModels = self.app.state.loaded
-        snapshot, alive = loaded._snapshot, True
-        for key, served in snapshot.served.items():
-            if key not in sent.revisions:
-                row = registry.find(loaded.database, *key)
-                alive &= channel.send(Version(key, row.folder, row.checksums or {}, served.base.scale))
-                sent.revisions[key] = 0
-            if served.revision > sent.revisions[key]:
-                alive &= channel.send(NewRevision(key, served.revision, Revision.of(served.model)))
-                sent.revisions[key] = served.revision
-            factors, payloads = served.scales._streams, served.payloads._streams
-            if sent.factors.get(key) is not factors or sent.payloads.get(key) is not payloads:
-                sent.factors[key], sent.payloads[key] = factors, payloads
-                alive &= channel.send(StreamState(key, dict(factors), _without_models(served.payloads)))
-        serving = {model: each.version for model, each in snapshot.serving.items()}
-        dropped = frozenset(sent.revisions.keys() - snapshot.served.keys())
-        pointers = Pointers(serving, dict(snapshot.aliases), dropped, frozenset(loaded._deleted))
-        if pointers != sent.pointers:
-            alive &= channel.send(pointers)
-            sent.pointers = pointers
-            for key in dropped:
-                del sent.revisions[key]
-        if self.app.state.storage.settings.keys_needed:
-            rows = list_keys(loaded.database)  # the real one: what the keyring has read, once a second
-            told = [(row.id, row.revoked_at, row.expires_at, row.scopes) for row in rows]
-            if told != sent.keys:
-                alive &= channel.send(("keys", [_plain(row) for row in rows]))
-                sent.keys = told
-        if sent.keys is None and alive:
-            alive = channel.send(("published",))
-            sent.keys = sent.keys or ()
-        return alive
+    def _complete(self, subscriber: Subscriber, holdings: Holdings) -> None:
+        """Load what a data plane held when this process was started."""
+        for model in {model for model, _ in holdings.revisions}:
+            self._can_load(model, None)  # the serving version
+        subscriber.complete({key: self._can_load(*key) for key in holdings.revisions})
+        self._loaded.changes.note()
+
+    def _can_load(self, model: str, version: int | None) -> bool | None:
+        """Load a version; return whether that is possible, None if it does not exist."""
+        try:
+            self._loaded.get(model, version)
+        except NotFoundError:
+            return None
+        except ServiceError as error:
+            logger.error("%s", error.message)
+            return False
+        return True
+
+    def _report(self) -> None:
+        confirmed = [each.confirmed for each in tuple(self._subscribers.values()) if each.answers]
+        self._confirmations.confirm(max(confirmed, default=inf))
 
 
-def _plain(row: ApiKeyRow) -> ApiKeyRow:
-    names = [column.name for column in ApiKeyRow.__table__.columns]
-    return ApiKeyRow(**{name: getattr(row, name) for name in names})
-
-
-def _without_models(payloads: Any) -> dict[str, Any]:
-    streams = dict(payloads._streams)
-    if payloads._default is not None:
-        streams[""] = payloads._default
-    return {name: (each.load, replace(each, model=None, load=None)) for name, each in streams.items()}
+def _name_of(message: Any) -> Any:
+    """Return what identifies a large message, so that it is pickled once for all data planes; None for a small one."""
+    match message:
+        case NewVersion(key):
+            return "version", key
+        case NewRevision(key, revision):
+            return "revision", key, revision
+        case NewPayload(_, number):
+            return "payload", number
+    return None

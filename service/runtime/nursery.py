@@ -164,11 +164,22 @@ def _answer(channel: socket.socket, handles: dict[int, int]) -> bool:
 
     try:
         pid = forking.fork(work, name)
+    except OSError as error:
+        channel.send(pickle.dumps((0, error)))
+    else:
+        _report(channel, handles, pid)
+    connection.close()
+    return True
+
+
+def _report(channel: socket.socket, handles: dict[int, int], pid: int) -> None:
+    """Send a handle of a process that was forked; kill the process if the kernel has no handles."""
+    try:
         handle = os.pidfd_open(pid)
     except OSError as error:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
         channel.send(pickle.dumps((0, error)))
     else:
         handles[handle] = pid
         socket.send_fds(channel, [pickle.dumps((pid, None))], [handle])
-    connection.close()
-    return True

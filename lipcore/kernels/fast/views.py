@@ -28,6 +28,11 @@ class Memory(threading.local):
 
     def __init__(self, fixed: Sequence[Array], work: int) -> None:
         self.flat = np.concatenate([*(np.ascontiguousarray(part).reshape(-1) for part in fixed), np.zeros(work)])
+        self._work = work
+
+    def __reduce__(self) -> tuple[type[Memory], tuple[list[Array], int]]:
+        """Pickle what is fixed; the threads of another process have work memory of their own."""
+        return Memory, ([self.flat[: len(self.flat) - self._work]], self._work)
 
 
 def _pointing(context: Any, builder: Any, kind: Any, pointer: Any, sizes: Sequence[Any], itemsize: int) -> Any:

@@ -55,6 +55,25 @@ class KeyRate:
             raise RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
 
 
+@dataclass(frozen=True)
+class KeyRecord:
+    """A stored key, as the fields of `Key` and its own rate limit, requests per s, say."""
+
+    id: str
+    digest: bytes
+    scopes: frozenset[str]
+    expires: float
+    revoked: bool
+    max_requests_per_s: float | None
+
+    @classmethod
+    def of(cls, row: ApiKeyRow) -> KeyRecord:
+        """Return the record of a database row."""
+        expires = inf if row.expires_at is None else datetime.fromisoformat(row.expires_at).timestamp()
+        digest, revoked = bytes.fromhex(row.hash), row.revoked_at is not None
+        return cls(row.id, digest, frozenset(row.scopes), expires, revoked, row.max_requests_per_s)
+
+
 @dataclass(slots=True, eq=False)
 class Key:
     """A stored key in memory. Times are Unix times in s.
@@ -154,17 +173,16 @@ def note_used(database: Database, seen: Mapping[str, float]) -> None:
             session.execute(update(ApiKeyRow).where(ApiKeyRow.id == key).values(used_at=iso_time(at)))
 
 
-def key_of(row: ApiKeyRow) -> Key:
-    """Return the key of a database row."""
-    expires = inf if row.expires_at is None else datetime.fromisoformat(row.expires_at).timestamp()
-    return Key(row.id, bytes.fromhex(row.hash), frozenset(row.scopes), expires, row.revoked_at is not None)
+def key_of(record: KeyRecord) -> Key:
+    """Return the key of a record."""
+    return Key(record.id, record.digest, record.scopes, record.expires, record.revoked)
 
 
 def state_of(row: ApiKeyRow, at: float) -> str:
     """Return `valid`, `expired` or `revoked`, the state of a key at a Unix time."""
     if row.revoked_at is not None:
         return "revoked"
-    return "valid" if key_of(row).valid(at) else "expired"
+    return "valid" if key_of(KeyRecord.of(row)).valid(at) else "expired"
 
 
 logger = logging.getLogger(__name__)
@@ -177,16 +195,20 @@ CHALLENGE = 'Bearer realm="lipserve"'
 
 
 class Keyring:
-    """The keys of one service, for its event loop. Empty until `watching`.
+    """The keys of one service, for its event loop. Empty until `watching` or `update`.
 
     `refresh_s` is the interval between reads of the database. `burst` limits the requests at once of a key with its own
-    rate, which are counted in `buckets`. `counters` have the last use of each key.
+    rate, which are counted in `buckets`. `counters` have the last use of each key. `records` are the keys as last
+    read.
     """
 
     def __init__(
         self, refresh_s: float, burst: int, counters: Counters | None = None, buckets: Buckets | None = None
     ) -> None:
         self._refresh_s, self._burst = refresh_s, burst
+        self.records: tuple[KeyRecord, ...] = ()
+        self.when_changed: list[Callable[[], None]] = []
+        """Functions called after the keys have changed."""
         self._counters = Counters() if counters is None else counters
         self._buckets = Buckets() if buckets is None else buckets
         self._keys: dict[bytes, Key] = {}
@@ -230,7 +252,7 @@ class Keyring:
     @asynccontextmanager
     async def watching(self, database: Database) -> AsyncIterator[None]:
         """Read the keys now and then regularly while the context is open."""
-        self._update_keys(await to_thread.run_sync(list_keys, database, limiter=self._thread))
+        self.update(await to_thread.run_sync(_read_records, database, limiter=self._thread))
         valid = sum(key.valid(time()) for key in self._keys.values())
         if valid:
             logger.info("API keys are required; %d valid", valid)
@@ -253,31 +275,36 @@ class Keyring:
     async def _refresh(self, database: Database) -> None:
         """Read the keys. If the database fails, keep the known keys, so that controllers continue."""
         try:
-            rows = await to_thread.run_sync(list_keys, database, limiter=self._thread)
+            records = await to_thread.run_sync(_read_records, database, limiter=self._thread)
         except Exception as error:
             if not self._failing:
                 logger.warning("API keys cannot be read; the known ones stay valid: %s", error)
             self._failing = True
         else:
             self._failing = False
-            self._update_keys(rows)
-        self._end_lasting()
+            self.update(records)
+        self.end_lasting()
 
-    def _update_keys(self, rows: list[ApiKeyRow]) -> None:
+    def update(self, records: tuple[KeyRecord, ...]) -> None:
+        """Replace the keys. Streams of a key that is revoked last until `end_lasting`."""
+        if records == self.records:
+            return
         known = {key.id: key for key in self._keys.values()}
         fresh: dict[bytes, Key] = {}
-        for row in rows:
-            read = key_of(row)
-            key = known.pop(read.id, read)  # the same object, which streams and rates refer to
-            key.scopes, key.expires, key.revoked = read.scopes, read.expires, read.revoked
-            if row.max_requests_per_s is not None and key.rate is None:
-                key.rate = KeyRate(row.max_requests_per_s, self._burst, self._buckets)
+        for record in records:
+            key = known.pop(record.id, None) or key_of(record)  # the same object, which streams and rates refer to
+            key.scopes, key.expires, key.revoked = record.scopes, record.expires, record.revoked
+            if record.max_requests_per_s is not None and key.rate is None:
+                key.rate = KeyRate(record.max_requests_per_s, self._burst, self._buckets)
             fresh[key.digest[:PREFIX_BYTES]] = key
         for gone in known.values():
             gone.revoked = True
-        self._keys = fresh
+        self._keys, self.records = fresh, records
+        for call in self.when_changed:
+            call()
 
-    def _end_lasting(self) -> None:
+    def end_lasting(self) -> None:
+        """End the streams of keys that are revoked or expired. Use it in the event loop, once a second."""
         at = time()
         for key in [key for key in self._lasting if not key.valid(at)]:
             ends = list(self._lasting[key])
@@ -299,6 +326,10 @@ class Keyring:
         except Exception as error:
             logger.warning("the last use of API keys could not be stored: %s", error)
         self._noted |= seen
+
+
+def _read_records(database: Database) -> tuple[KeyRecord, ...]:
+    return tuple(map(KeyRecord.of, list_keys(database)))
 
 
 def invalid_key(message: str) -> UnauthorizedError:

@@ -123,7 +123,7 @@ class ObservationLog:
     def _publish(self, session: Session, monitor: Monitor, model: str) -> None:
         """Set the payloads and interval factors of a model's streams on all of its versions."""
         adaptive = owner.read_options(session, model).adaptive_intervals
-        for version, served in self.loaded.served(model).items():
+        for version, served in self.loaded.snapshot.versions_of(model).items():
             if served.carrier is not None:
                 served.payloads.replace(monitor.payloads.build_models(served.carrier, version))
         for version, scales in self.loaded.scales(model).items():

@@ -123,7 +123,7 @@ class Weighing:
             self._forget_sent(message.stream)
             return
         model, version, stream_id = message.stream
-        served = self.loaded.served(model).get(version)
+        served = self.loaded.snapshot.versions_of(model).get(version)
         if served is None or served.carrier is None:
             return
         monitor = self._monitor(served)

@@ -65,7 +65,7 @@ def evict_model(arm, loaded_models):
     """Load other models until this one is evicted."""
     for number in range(loaded_models.capacity):
         other = f"other-{number}"
-        if other not in {name for name, _ in loaded_models._snapshot.served}:
+        if other not in {name for name, _ in loaded_models.snapshot.served}:
             arm.publish(other)
         loaded_models.get(other, None)
     assert loaded_models.hot(ARM, None) is None
@@ -123,7 +123,7 @@ def test_evicted_version_held_by_a_stream_keeps_learning(arm, loaded_models):
     assert publish_revision(arm, loaded_models, 4)
     assert loaded_models.hot(ARM, None).revision == 4
     assert loaded_models.hot(ARM, None).base is held.base
-    assert len(loaded_models._snapshot.served) == loaded_models.capacity
+    assert len(loaded_models.snapshot.served) == loaded_models.capacity
 
 
 def test_started_service_restores_from_the_log(arm):

@@ -104,7 +104,7 @@ def test_alias_to_a_version_not_in_memory_loads_it(api, arm):
     for number in range(loaded.capacity):
         publish(api, f"crowd-{number}")
         predict(api, f"crowd-{number}")
-        assert len(loaded._snapshot.served) <= loaded.capacity
+        assert len(loaded.snapshot.served) <= loaded.capacity
     assert loaded.hot(arm, None, "production") is None
     assert predict(api, arm, alias="production").json()["version"] == 1
     assert loaded.hot(arm, None, "production").version == 1

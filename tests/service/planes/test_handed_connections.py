@@ -3,11 +3,12 @@
 import json
 import os
 import socket
+from contextlib import suppress
 
 import pytest
 
 from service.api.limits.requests import COUNTED, ClientPatience
-from tests.service.api.limits.serving import RawConnection
+from tests.service.api.limits.serving import RawConnection, Serving
 from tests.service.data import DEADLINE, eventually
 from tests.service.planes.requests import ECHO, HOST, PAGE, Digest, echo
 from tests.service.planes.two_planes import TwoPlanes
@@ -142,3 +143,26 @@ def test_queries_are_answered_without_a_control_plane(planes):
         assert "control plane" in message
         assert planes.refusal(echo(b"later"))[:2] == (503, "not_ready")
         assert other.ask(echo(b"abc"))[0] == 200  # by the control plane, which cannot pass it back
+
+
+@pytest.mark.parametrize("kind", [Serving, TwoPlanes])
+@pytest.mark.parametrize("request_bytes", [echo(b"abc"), echo(b"later"), PAGE], ids=["query", "handed over", "page"])
+def test_client_that_sends_nothing_more_gets_its_answer(kind, request_bytes):
+    with kind(with_app=Digest()) as serving, serving.connect(request_bytes) as client:
+        client.socket.shutdown(socket.SHUT_WR)
+        assert client.read_answer()[0] == 200
+        assert client.read_to_end() == b""
+
+
+def test_connection_on_its_way_to_a_control_plane_that_ends_is_closed(planes):
+    planes.planes.close()
+    waiting, _ = planes.accepting.accept()  # the next control plane, which reads nothing
+    with planes.connect() as client:
+        assert client.ask(echo(b"abc"))[0] == 200
+        eventually(lambda: planes.link.is_connected)
+        client.send(PAGE)
+        eventually(lambda: planes.link.passed.count(None) == 1)
+        waiting.close()
+        with suppress(ConnectionResetError):
+            assert client.socket.recv(1) == b""
+        eventually(lambda: planes.link.passed.count(None) == 0)

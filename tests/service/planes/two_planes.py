@@ -16,8 +16,11 @@ from service.api.limits.requests import PATIENCE, ClientPatience
 from service.api.server.connections import guarded
 from service.api.server.sockets import DRAIN_S, Server
 from service.foundation.settings import Settings
+from service.models.changes import Changes
+from service.models.snapshot import Snapshot
 from service.planes import dataplanes
 from service.planes.channel import Channel
+from service.planes.confirmations import Confirmations
 from service.planes.connections import CONNECTION, DataProtocol, DataStream
 from service.planes.link import ControlLink
 from service.telemetry.readiness import StopState
@@ -25,14 +28,11 @@ from tests.service.api.limits.serving import Serving
 from tests.service.data import DEADLINE, eventually
 
 
-class NoPublisher:
-    """Publishes nothing."""
+class NoModels:
+    """Loaded models of a service without any."""
 
-    def __init__(self, app: Any, channel: Channel) -> None:
-        pass
-
-    def start(self) -> None:
-        """Publish nothing."""
+    def __init__(self) -> None:
+        self.changes, self.snapshot = Changes(), Snapshot()
 
 
 class QueriesApp:
@@ -106,8 +106,9 @@ class TwoPlanes(Serving):
         made = partial(guarded, patience=self.patience)
         self.server.config.load()
         self.server.lifespan = self.server.config.lifespan_class(self.server.config)
-        state = SimpleNamespace(storage=SimpleNamespace(settings=self.settings), learners=None)
-        with patch.object(dataplanes, "Publisher", NoPublisher), patch.object(dataplanes, "guarded", made):
+        state = SimpleNamespace(storage=SimpleNamespace(settings=self.settings), learners=None, loaded=NoModels())
+        state.keyring, state.confirmations = None, Confirmations()
+        with patch.object(dataplanes, "guarded", made):
             self.planes = dataplanes.DataPlanes(SimpleNamespace(state=state), self.server)
             connection, _ = await asyncio.to_thread(self.accepting.accept)
             self.planes.add(Channel(connection))

@@ -1,0 +1,42 @@
+"""Files in memory, mapped without a file descriptor: a process may map thousands."""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+from typing import Any
+
+import numpy as np
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_libc.mmap.restype = ctypes.c_void_p
+_libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
+_libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
+_FAILED = ctypes.c_void_p(-1).value
+
+
+class _Pages:
+    """Mapped pages, which NumPy reads as an array. They are freed with the last array that refers to them."""
+
+    def __init__(self, address: int, size: int) -> None:
+        self._address, self._size = address, size
+        self.__array_interface__ = {"version": 3, "typestr": "|u1", "shape": (size,), "data": (address, False)}
+
+    def __del__(self) -> None:
+        _libc.munmap(self._address, self._size)
+
+
+def map_file(file: int, size: int) -> memoryview:
+    """Return the first `size` bytes of a file, at least one. Raise OSError or ValueError.
+
+    `mmap.mmap` would keep a descriptor as long as an array refers to the file. The pages are private and writable, as
+    those of other arrays are; they stay shared because nobody writes.
+    """
+    if not 0 < size <= os.fstat(file).st_size:  # reading beyond the end would kill the process
+        raise ValueError(f"the file has {os.fstat(file).st_size} bytes, expected {size}")
+    address = _libc.mmap(None, size, mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_PRIVATE, file, 0)
+    if address == _FAILED:
+        raise OSError(ctypes.get_errno(), "a file in memory cannot be mapped")
+    pages: Any = np.asarray(_Pages(address, size))
+    return memoryview(pages)

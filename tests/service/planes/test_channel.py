@@ -1,0 +1,200 @@
+"""Channels between processes: messages of all sizes, file descriptors, closed ends and damaged messages."""
+
+import gc
+import mmap
+import os
+import pickle
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from service.planes.channel import MAX_MESSAGE_BYTES, MIN_SHARED_BYTES, Channel, Package
+
+
+@pytest.fixture
+def ends():
+    """Two ends of a channel, and the socket of the first."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    one, other = Channel(ours), Channel(theirs)
+    yield one, other, ours
+    one.close()
+    other.close()
+
+
+def count_fds():
+    gc.collect()
+    return len(os.listdir("/proc/self/fd"))
+
+
+def arrays(size):
+    """Return a message whose arrays have about this size, in bytes."""
+    rng = np.random.default_rng(size)
+    return {"a": rng.normal(size=max(size // 16, 1)), "b": rng.normal(size=(2, max(size // 32, 1))), "text": "x" * 9}
+
+
+@pytest.mark.parametrize("size", [0, 100, MIN_SHARED_BYTES - 500, MIN_SHARED_BYTES, 10 * MAX_MESSAGE_BYTES, 30_000_000])
+def test_arrays_arrive_as_sent(ends, size):
+    one, other, _ = ends
+    message, before = arrays(size), count_fds()
+    assert one.send(message)
+    found, fds = other.receive()
+    assert fds == []
+    for name in ("a", "b"):
+        np.testing.assert_array_equal(found[name], message[name])
+        found[name][...] = 1.0  # writable, and of this receiver alone
+    assert found["text"] == message["text"]
+    assert count_fds() == before
+
+
+@pytest.mark.parametrize("count", [10, 100_000])
+def test_messages_without_arrays_may_be_large(ends, count):
+    one, other, _ = ends
+    message = {("model", number): number for number in range(count)}
+    assert one.send(message)
+    assert other.receive() == (message, [])
+
+
+def test_descriptors_arrive_with_large_messages(ends):
+    one, other, _ = ends
+    before, (read, write) = count_fds(), os.pipe()
+    for size in (10, 1_000_000):
+        assert one.send(arrays(size), [write])
+        _, (received,) = other.receive()
+        assert not os.get_inheritable(received)
+        os.write(received, b"hello")
+        assert os.read(read, 5) == b"hello"
+        os.close(received)
+    os.close(read)
+    os.close(write)
+    assert count_fds() == before
+
+
+def test_receivers_of_a_package_share_its_pages(ends):
+    """A page that both have mapped counts half for each of them in /proc/self/smaps."""
+    one, other, _ = ends
+    package, before = Package.of(np.ones(1_000_000)), count_fds()
+    assert package.size >= 8_000_000
+    for _ in range(2):
+        assert one.send(package)
+    found = [other.receive()[0] for _ in range(2)]
+    package.close()
+    package.close()
+    assert [each.sum() for each in found] == [1_000_000.0] * 2
+    assert proportional_kib("lipserve") < 1.1 * 8_000_000 / 1024
+    assert count_fds() == before - 1
+    del found
+    gc.collect()
+    assert proportional_kib("lipserve") == 0
+
+
+def proportional_kib(name):
+    """Return the proportional size of all mappings of files in memory of a name, KiB."""
+    with open("/proc/self/smaps") as file:
+        size, counts = 0, False
+        for line in file:
+            if "-" in line.split()[0]:
+                counts = f"/memfd:{name}" in line
+            elif counts and line.startswith("Pss:"):
+                size += int(line.split()[1])
+    return size
+
+
+def test_mapped_messages_hold_no_descriptors(ends):
+    one, other, _ = ends
+    before = count_fds()
+    kept = []
+    for _ in range(100):
+        assert one.send(arrays(100_000))
+        kept.append(other.receive())
+    assert count_fds() == before
+    assert len(kept) == 100
+
+
+def test_closed_ends_are_noticed(ends):
+    one, other, _ = ends
+    waiting = threading.Thread(target=other.receive)
+    waiting.start()
+    one.close()
+    waiting.join()
+    assert other.receive() is None
+    assert not other.send("lost")
+    assert not one.send("lost")
+    assert one.receive() is None
+
+
+def test_receiver_returns_when_its_own_end_is_closed(ends):
+    _, other, _ = ends
+    found = []
+    waiting = threading.Thread(target=lambda: found.append(other.receive()))
+    waiting.start()
+    other.close()
+    waiting.join()
+    assert found == [None]
+
+
+def test_full_socket_is_waited_for_only_within_the_limit(ends):
+    one, other, _ = ends
+    sent = 0
+    while one.send(b"x" * 1000, wait=False):
+        sent += 1
+    assert sent > 10
+    one.limit_wait(0.01)
+    assert not one.send(b"x" * 1000)
+    assert not one.send(arrays(1_000_000))
+    for _ in range(sent):
+        assert other.receive() == (b"x" * 1000, [])
+    assert one.send("room again")
+    assert other.receive() == ("room again", [])
+
+
+def header(places, has_file):
+    """Return the start of a message."""
+    data = pickle.dumps(places, 5)
+    return len(data).to_bytes(4, "little") + bytes([has_file]) + data
+
+
+DAMAGED = {
+    "noise": b"\xff" * 100,
+    "a header alone": header([], False),
+    "an unfinished pickle": header([], False) + pickle.dumps(list(range(100)))[:-5],
+    "a class that does not exist": header([], False) + b"cservice.nothing\nNothing\n.",
+    "no file": header([(0, 10)], True),
+    "a size of the header beyond the end": b"\xff\xff\xff\x7f\x00",
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_damaged_messages_end_the_connection(ends, name, caplog):
+    _, other, raw = ends
+    before, (read, write) = count_fds(), os.pipe()
+    socket.send_fds(raw, [DAMAGED[name]], [] if name == "no file" else [read])
+    assert other.receive() is None
+    assert "cannot be read" in caplog.text
+    os.close(read)
+    os.close(write)
+    assert count_fds() == before
+
+
+@pytest.mark.parametrize("places", [[(0, mmap.PAGESIZE + 1)], [(0, 0)], [(0, 10), (5000, 10_000)], [(0, -1)], []])
+def test_files_shorter_than_stated_are_not_read(ends, places, caplog):
+    _, other, raw = ends
+    before, file = count_fds(), os.memfd_create("short")
+    os.truncate(file, mmap.PAGESIZE)
+    socket.send_fds(raw, [header(places, True)], [file])
+    assert other.receive() is None
+    assert "cannot be read" in caplog.text
+    os.close(file)
+    assert count_fds() == before
+
+
+def test_more_descriptors_than_expected_are_closed(ends, caplog):
+    _, other, raw = ends
+    before, (read, write) = count_fds(), os.pipe()
+    socket.send_fds(raw, [header([], False) + pickle.dumps(1)], [read] * 50)
+    assert other.receive() is None
+    assert "larger than the limit" in caplog.text
+    os.close(read)
+    os.close(write)
+    assert count_fds() == before
