@@ -166,6 +166,7 @@ def main() -> None:
             process.start()
         for number in range(given.windows):
             for each in given.planes if number % 2 == 0 else reversed(given.planes):
+                print(f"window {number + 1} with data plane {each}", file=sys.stderr)
                 with serving(homes[each], _settings(each)) as bed:
                     results.setdefault(each, []).append(measure(bed, given.loads, given.rate, given.seconds))
     print(f"model {MODEL}, learning {ARM}, loads: {', '.join(given.loads) or 'none'}, {given.spin} busy processes")
