@@ -121,10 +121,11 @@ class Nursery:
 _nursery: Nursery | None = None
 
 
-def start() -> None:
+def start() -> Nursery:
     """Fork the nursery of this process; call it before any thread starts."""
     global _nursery  # noqa: PLW0603 - one a process
     _nursery = Nursery()
+    return _nursery
 
 
 def current() -> Nursery | None:
@@ -149,7 +150,10 @@ def _tend(channel: socket.socket) -> None:
 
 def _answer(channel: socket.socket, handles: dict[int, int]) -> bool:
     """Fork the process that the next message requests; return False if the parent is gone."""
-    request, given, _, _ = socket.recv_fds(channel, MAX_REQUEST_BYTES, 1)
+    try:
+        request, given, _, _ = socket.recv_fds(channel, MAX_REQUEST_BYTES, 1)
+    except ConnectionResetError:  # it had exit codes to read
+        return False
     if not request:
         return False
     connection = Connection(given[0])
