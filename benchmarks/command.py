@@ -16,7 +16,7 @@ from benchmarks.latency import table
 from benchmarks.latency.running import KEYS, Options, run
 from benchmarks.latency.targets import targets
 from benchmarks.online.command import durability, online
-from benchmarks.options import QUICK_FIT, JsonFile, Markdown, Seed, Strict, begin, report, split_names, targets_json
+from benchmarks.options import QUICK_FIT, JsonFile, Markdown, Seed, Strict, begin, report, split_names
 from benchmarks.real import report as real_report
 from benchmarks.real import running as real_running
 from benchmarks.real.cells import product_revision
@@ -81,9 +81,7 @@ def latency(
     console = begin()
     results = run(options, console)
     found = targets(results)
-    if json_file is not None:
-        results.write(json_file, targets_json(found))
-    report(table.grids(results), results.notes, found, console, markdown, strict)
+    report(table.grids(results), results.notes, found, console, markdown, strict, json_file, results)
 
 
 for _command in (online, durability, load, soak, batch):
@@ -105,9 +103,7 @@ def ingest(
     console = begin()
     results = ingest_running.run(options, console)
     found = ingest_running.targets(results)
-    if json_file is not None:
-        results.write(json_file, targets_json(found))
-    report(ingest_running.grids(results), [], found, console, markdown, strict)
+    report(ingest_running.grids(results), [], found, console, markdown, strict, json_file, results)
 
 
 @app.command()
@@ -131,9 +127,7 @@ def scale(
     options = scale_running.Options(**chosen)
     console = begin()
     results = scale_running.run(options, console)
-    if json_file is not None:
-        results.write(json_file)
-    report(list(results.grids()), results.notes(), results.targets(), console, markdown, strict)
+    report(list(results.grids()), results.notes(), results.targets(), console, markdown, strict, json_file, results)
 
 
 @app.command()
@@ -157,9 +151,7 @@ def exported(
     options = exported_running.Options(folder.absolute(), calls, flags=tuple(flags.split()), eigen=eigen, seed=seed)
     results = exported_running.run(options, console)
     found = exported_running.targets(results)
-    if json_file is not None:
-        results.write(json_file, targets_json(found))
-    report(exported_running.grids(results), [], found, console, markdown, strict)
+    report(exported_running.grids(results), [], found, console, markdown, strict, json_file, results)
 
 
 @app.command()

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 import typer
 from rich.console import Console
@@ -37,6 +37,13 @@ def split_names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 
 
+class Figures(Protocol):
+    """Results of a benchmark."""
+
+    def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
+        """Write all figures and the targets as JSON."""
+
+
 def targets_json(found: Sequence[Target]) -> list[dict[str, Any]]:
     """Return the targets as JSON values."""
     return [{**asdict(each), "met": each.met} for each in found]
@@ -49,8 +56,15 @@ def report(
     console: Console,
     markdown: Path | None,
     strict: bool,
+    json_file: Path | None = None,
+    results: Figures | None = None,
 ) -> None:
-    """Print the tables and the number of missed targets; with `strict`, exit with 1 if a target is missed."""
+    """Print the tables and the number of missed targets; with `strict`, exit with 1 if a target is missed.
+
+    markdown: file that the tables are written to, too. json_file: the same for all figures of the results.
+    """
+    if json_file is not None and results is not None:
+        results.write(json_file, targets_json(found))
     table.show_grids(grids, notes, console)
     if markdown is not None:
         markdown.write_text(table.grids_markdown(grids, notes))

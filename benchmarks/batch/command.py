@@ -10,7 +10,7 @@ import typer
 from benchmarks.batch import running as batch_running
 from benchmarks.batch import transports as batch_transports
 from benchmarks.exported import running as exported_running
-from benchmarks.options import JsonFile, Markdown, Strict, begin, report, targets_json
+from benchmarks.options import JsonFile, Markdown, Strict, begin, report
 
 SIZES, TRANSPORT_SIZES = "1,10,100,1000,10000,100000,1000000", "10000,100000"
 
@@ -49,6 +49,4 @@ def batch(
         options = batch_running.Options(folder, counts, repetitions, eigen, device)
         results = batch_running.run(options, console)
         found, grids, notes = batch_running.targets(results), batch_running.grids(results), results.notes
-    if json_file is not None:
-        results.write(json_file, targets_json(found))
-    report(grids, notes, found, console, markdown, strict)
+    report(grids, notes, found, console, markdown, strict, json_file, results)

@@ -6,7 +6,7 @@ import json
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ class Options:
     Attributes:
         folder: folder of the model.
         calls: calls of each function.
-        queries: number of instants of the motion.
+        queries: max number of instants of the motion; each is called at least once.
         flags: compiler flags of the model. Pinocchio is called with -O2, as its library is compiled.
         eigen: folder of Eigen's headers, to call Pinocchio from C++; None: from Python.
         seed: seed of the motion.
@@ -72,6 +72,7 @@ def run(options: Options, console: Console) -> Results:
     """Run the benchmark; raise BenchError if a compiler or a program fails."""
     model = load(options.folder)
     results = Results(facts.machine(), model.estimator.name)
+    options = replace(options, queries=min(options.queries, options.calls))
     motion = _motion(model.training_range, options)
     with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as home:
         folder = Path(home)

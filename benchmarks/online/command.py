@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -29,7 +27,6 @@ from benchmarks.options import (
     begin,
     report,
     split_names,
-    targets_json,
 )
 
 QUICK_ONLINE: dict[str, Any] = {
@@ -92,9 +89,7 @@ def online(
     console = begin()
     results = online_running.run(options, console)
     found = online_targets(results)
-    if json_file is not None:
-        results.write(json_file, targets_json(found))
-    report(online_table.grids(results), results.notes, found, console, markdown, strict)
+    report(online_table.grids(results), results.notes, found, console, markdown, strict, json_file, results)
 
 
 def _measure_payloads(options: pickup.Options, json_file: Path | None, markdown: Path | None, strict: bool) -> None:
@@ -103,9 +98,7 @@ def _measure_payloads(options: pickup.Options, json_file: Path | None, markdown:
     with facts.one_thread():
         found = pickup.run(options, console)
     targeted = pickup_table.targets(found)
-    if json_file is not None:
-        found.write(json_file, targets_json(targeted))
-    report(pickup_table.grids(found), pickup_table.NOTES, targeted, console, markdown, strict)
+    report(pickup_table.grids(found), pickup_table.NOTES, targeted, console, markdown, strict, json_file, found)
 
 
 def durability(
@@ -120,6 +113,4 @@ def durability(
     with TemporaryDirectory(prefix="lipserve-bench-") as folder:
         tally = durable.run(Path(folder), trials, seed, console)
     found = durable.targets(tally)
-    if json_file is not None:
-        json_file.write_text(json.dumps({**asdict(tally), "targets": targets_json(found)}, indent=2) + "\n")
-    report(durable.grids(tally), [durable.NOTE], found, console, markdown, strict)
+    report(durable.grids(tally), [durable.NOTE], found, console, markdown, strict, json_file, tally)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sqlite3
 import time
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from threading import Timer
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -68,6 +69,10 @@ class Tally:
     refused: int = 0
     largest: float = 0.0
     one_batch: float = 0.0
+
+    def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
+        """Write all counts as JSON."""
+        path.write_text(json.dumps({**asdict(self), "targets": targets}, indent=2) + "\n")
 
 
 class Trials:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +45,7 @@ class Results:
             yield from part.grids
         yield targets_grid(self.targets(), "")
 
-    def write(self, path: Path) -> None:
-        """Write the results as JSON."""
-        targets = [{**asdict(each), "met": each.met} for each in self.targets()]
+    def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
+        """Write the results and the targets as JSON."""
         parts = {part.name: part.figures for part in self.parts}
         path.write_text(json.dumps({"machine": self.machine, **parts, "targets": targets}, indent=2) + "\n")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.options import JsonFile, Markdown, Robot, Seed, Strict, begin, report, targets_json
+from benchmarks.options import JsonFile, Markdown, Robot, Seed, Strict, begin, report
 from benchmarks.soak import hours as soak_hours
 from benchmarks.soak import running as soak_running
 from benchmarks.soak import table as soak_table
@@ -28,9 +28,7 @@ def load(
     console = begin()
     results = soak_running.run(options, console)
     found = soak_table.targets(results)
-    if json_file is not None:
-        results.write(json_file, targets_json(found))
-    report(soak_table.grids(results), [], found, console, markdown, strict)
+    report(soak_table.grids(results), [], found, console, markdown, strict, json_file, results)
 
 
 def soak(
@@ -54,8 +52,6 @@ def soak(
     console = begin()
     results = soak_hours.run(options, console)
     found = soak_hours.targets(results)
-    if json_file is not None:
-        results.write(json_file, targets_json(found))
     if plot is not None:
         soak_hours.draw(results, plot)
-    report(soak_hours.grids(results), [], found, console, markdown, strict=True)
+    report(soak_hours.grids(results), [], found, console, markdown, True, json_file, results)

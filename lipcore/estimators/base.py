@@ -53,11 +53,12 @@ def check_base(
     estimator: str,
     options: FitOptions,
     robot: str | None,
+    arms: int = 1,
 ) -> None:
     """Raise BaseMismatchError unless a training can start from a base.
 
     name: of the base; order: the data's joint at each place of its arm's chain, (n,), None if it has no arm; data:
-    robot of the training data; estimator, options, robot: of the training.
+    robot of the training data; estimator, options, robot: of the training; arms: number of the base's arms.
     """
     robots = (AUTO, *ROBOT_ESTIMATORS)
     if order is None:
@@ -67,6 +68,9 @@ def check_base(
     if (found := data.difference(base)) is not None:
         field, own, others = found
         raise BaseMismatchError("base", name, f"a version with the {field} of the data, {own}; it has {others}")
+    if estimator == CHAINED_ARM and arms > 1:
+        expected = f"{' or '.join(robots[:3])}, as the base has {arms} arms and {CHAINED_ARM} needs one serial chain"
+        raise BaseMismatchError("estimator", estimator, expected)
     if estimator == CHAINED_ARM and list(order) != list(range(len(order))):
         expected = f"{' or '.join(robots[:2])}, as the joints of the base have another order"
         raise BaseMismatchError("estimator", estimator, expected)

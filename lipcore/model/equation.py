@@ -17,14 +17,14 @@ import numpy as np
 
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import Estimator
-from lipcore.kernels.base import LinearKernel, TorqueKernel
+from lipcore.kernels.base import TorqueKernel
 from lipcore.kernels.combined import SumKernel
 from lipcore.kernels.drive.kernel import DriveKernel
 from lipcore.kernels.drive.play import deflections_of
-from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.residual import ResidualKernel
 from lipcore.model.functionals import Estimate, combine_torques
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.gravity import Gravity
 from lipcore.vocabulary import ENERGY_ESTIMATORS
 
 if TYPE_CHECKING:
@@ -97,35 +97,26 @@ class LinearBodies:
     def __init__(self, posterior: CompactPosterior) -> None:
         terms = [term for term in posterior.basis.linear if not isinstance(term, ResidualKernel)]
         # a correction is before the other terms
-        self._columns = columns = slice(posterior.basis.rows(terms[0]).start, len(posterior.basis))
-        mask = np.concatenate([_body_weights(term, posterior.basis.rows(term)) for term in terms])
-        self._fills, self._size, self._std_factor = [], len(mask), posterior.std_factor
-        for term in terms:
-            rows = posterior.basis.rows(term)
-            if mask[rows.start - columns.start : rows.stop - columns.start].any():
-                self._fills.append((rows.start - columns.start, term.regressor().fill_many))
+        columns = slice(posterior.basis.rows(terms[0]).start, len(posterior.basis))
+        self._bodies = Gravity(terms, [term.regressor() for term in terms])
+        mask, self._std_factor = self._bodies.mask, posterior.std_factor
         self._slopes = posterior.slopes[columns] * mask
         # the root is lower triangular: above these rows, these columns are zero
         self._root = posterior.feature_root[columns, columns] * mask
 
     def torques(self, motions: Array) -> Array:
         """Return the mean torques at N instants, (N, n). motions: as of `Motion.arrays`."""
-        return self._mean(self._features(motions))
+        return self._mean(self._bodies.features(motions))
 
     def estimate(self, motions: Array) -> Estimate:
         """Return the torques at N instants and their standard deviations, (N, n) each."""
-        features = self._features(motions)
+        features = self._bodies.features(motions)
         std = self._std_factor * np.sqrt(np.square(self._root @ features).sum(axis=1))
         return Estimate(self._mean(features), std)
 
     def _mean(self, features: Array) -> Array:
-        return np.asarray((self._slopes @ features.swapaxes(0, 1).reshape(self._size, -1)).reshape(len(features), -1))
-
-    def _features(self, motions: Array) -> Array:
-        features = np.zeros((len(motions), self._size, motions.shape[2]))
-        for first, fill_many in self._fills:
-            fill_many(motions, features, first)
-        return features
+        rows = features.swapaxes(0, 1).reshape(len(self._slopes), -1)
+        return np.asarray((self._slopes @ rows).reshape(len(features), -1))
 
 
 def dynamics_terms(estimator: Estimator) -> list[TorqueKernel]:
@@ -162,13 +153,6 @@ def _torques(model: TorqueModel, motions: Array) -> Array:
 def _bodies(estimator: Estimator) -> TorqueKernel:
     """Return the terms of f."""
     return SumKernel(*dynamics_terms(estimator), *gains(estimator))
-
-
-def _body_weights(term: LinearKernel, rows: slice) -> Array:
-    """Return 1 for the weights of bodies and gains, 0 for those of friction and alternative arms, (p,)."""
-    if isinstance(term, DriveKernel):
-        return term.gains.astype(np.float64)
-    return np.full(rows.stop - rows.start, float(not isinstance(term, MixtureKernel)))
 
 
 def _check_energies(model: TorqueModel, what: str) -> None:

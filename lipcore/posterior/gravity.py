@@ -1,4 +1,4 @@
-"""The linear terms' features without gravity: those of a motion minus those at rest in the same posture."""
+"""The linear terms' features of bodies: which weights they have, and the features of gravity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from lipcore.kernels.residual import ResidualKernel
 
 
 class Gravity:
-    """Gravity in the features of linear terms: the torque of bodies and payload at rest, with their gains."""
+    """Gravity in the features of linear terms: the torque of bodies and payload at rest, with their gains.
+
+    It is thread-safe.
+    """
 
     def __init__(self, linear: Sequence[LinearKernel], regressors: Sequence[Regressor]) -> None:
         self._terms: list[tuple[Regressor, int, slice | Indices]] = []
@@ -25,6 +28,20 @@ class Gravity:
             if places is not None:
                 self._terms.append((regressor, first, places))
             first += regressor.size
+        self.mask = np.zeros(first)
+        """1 for the weights of bodies and gains, 0 for those of friction, correction and alternative arms, (P,)."""
+        for _, _, places in self._terms:
+            self.mask[places] = 1.0
+
+    def features(self, motions: Array) -> Array:
+        """Return the features of N queries, (N, P, n), whose product with `mask` is that of bodies and gains.
+
+        motions: as of `Motion.arrays`.
+        """
+        features = np.zeros((len(motions), len(self.mask), motions.shape[2]))
+        for regressor, first, _ in self._terms:
+            regressor.fill_many(motions, features, first)
+        return features
 
     def subtract(self, motions: Array, features: Array) -> None:
         """Subtract gravity from the features of N queries, (N, P, n). motions: as of `Motion.arrays`."""

@@ -81,6 +81,7 @@ def train(
             estimator,
             options,
             None if robot is None else robot.name,
+            1 if base.arm is None else len(base.arm.geometry.roots),
         )
         robot, sibling = base.robot, arm_of_sibling(base)
     task = Task(

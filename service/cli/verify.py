@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import typer
 from rich.markup import escape
@@ -24,9 +24,10 @@ from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.foundation.text import counted
 from service.journal.floor import error_floor_of
-from service.journal.log import decode
+from service.journal.log import EventKind, decode
 from service.journal.recompute import check_same, find_gap, recompute, state_as_trained
 from service.journal.restore import RestoredState, restore
+from service.learning.owner import read_options
 from service.models import registry
 from service.runtime.process import SERVING_THREADS
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, ServingRow, SnapshotRow, VersionRow
@@ -89,16 +90,25 @@ def verify_home(settings: Settings) -> Verified:
 def _verify(database: Database, files: Files) -> Verified:
     findings = Verified()
     findings.damages += [Damage("database", FILE, each) for each in database.adapter.inconsistencies(20)]
+    is_damaged = bool(findings.damages)
     for kind, check in _CHECKS.items():
         findings.read[kind] = 0
-        for name, gone, reason in check(database, files):
-            findings.read[kind] += 1
-            if reason is None:
-                continue
-            with database.session() as session:
-                if not gone(session):
-                    findings.damages.append(Damage(kind.removesuffix("s"), name, reason))
+        try:
+            _check(database, kind, check(database, files), findings)
+        except Exception:  # rows of a damaged database may contain anything
+            if not is_damaged:
+                raise
     return findings
+
+
+def _check(database: Database, kind: str, found: Iterator[_Finding], findings: Verified) -> None:
+    for name, gone, reason in found:
+        findings.read[kind] += 1
+        if reason is None:
+            continue
+        with database.session() as session:
+            if not gone(session):
+                findings.damages.append(Damage(kind.removesuffix("s"), name, reason))
 
 
 _Finding = tuple[str, Callable[[Session], bool], str | None]
@@ -196,6 +206,7 @@ def _models(database: Database, files: Files) -> Iterator[_Finding]:
 
 def _read_model(database: Database, files: Files, model: str, version: int, base: lipcore.TorqueModel) -> None:
     with database.moment() as session:
+        read_options(session, model)
         gap = find_gap(session, model)
     if gap is not None:
         raise ValueError(f"its log lacks events between {gap[0]} and {gap[1]}")
@@ -218,6 +229,8 @@ def _observations(database: Database, files: Files) -> Iterator[_Finding]:
 
 
 def _read_event(row: EventRow) -> None:
+    if row.kind not in get_args(EventKind):
+        raise ValueError(f"the event is of the unknown kind {row.kind!r}")
     rows = decode(row.payload or b"")
     # a batch without accelerations is logged with the rows of adjacent batches that it completes
     first, last = (row.report or {}).get("own", (0, len(rows)))

@@ -65,7 +65,7 @@ def find_gap(session: Session, model: str) -> tuple[int, int] | None:
     """
     before: int | None = None
     events = select(EventRow.number, EventRow.kind).where(EventRow.model == model).order_by(EventRow.number)
-    for number, kind in session.execute(events):
+    for number, kind in session.execute(events.execution_options(yield_per=1000)):
         if before is not None and number != before + 1:
             return before, number
         before = number if before is not None or kind != "settings" else None

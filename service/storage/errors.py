@@ -62,6 +62,8 @@ def _of_database(error: DBAPIError) -> ServiceError | None:
         return StorageUnavailableError(_LOCKED, headers=RETRY_AFTER)
     if primary == sqlite3.SQLITE_FULL:
         return StorageFullError(_NO_SPACE)
+    if primary is None and "decode to UTF-8" in str(error.orig):  # by the driver, which adds the whole text
+        return StorageUnavailableError("the database is damaged: a text is not UTF-8; run `lipserve verify`")
     if primary in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
         return StorageUnavailableError(f"the database is damaged: {error.orig}; see the service's log")
     if primary in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM):

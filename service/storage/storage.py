@@ -117,7 +117,7 @@ def lock_home(home: Path) -> ExitStack:
 def check_home(settings: Settings) -> None:
     """Check that a service can start: the home is unused and writable, its database undamaged and up to date.
 
-    Takes about 0.3 s per GB of the database. Raise HomeError.
+    Takes about 0.5 s per GB of the database, and 4 µs per batch of the log. Raise HomeError.
     """
     home = settings.home
     with lock_home(home), explain_home_errors(settings):

@@ -135,10 +135,13 @@ def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_t
     manifest = base.manifest
     of_base = RobotKind.of_manifest(manifest)
     of_data = RobotKind(tuple(data.joint_names), tuple(joint_types), data.torque_convention)
-    order = manifest["parameters"].get("geometry", {}).get("order")
+    geometry = manifest["parameters"].get("geometry", {})
+    arms = 1 + sum(joint.get("root", False) for joint in geometry.get("joints", ()))
     options, name = FitOptions(**request.options.model_dump()), f"{base.model}:{base.version}"
     try:
-        check_base(name, of_base, order, of_data, request.estimator, options, request.robot)
+        check_base(
+            name, of_base, geometry.get("order"), of_data, request.estimator, options, request.robot, arms
+        )
     except BaseMismatchError as error:
         raise invalid_request(error.field, error.value, error.expected) from None
 

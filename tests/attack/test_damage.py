@@ -2,18 +2,20 @@
 
 import shutil
 from dataclasses import dataclass, field
+from json import JSONDecodeError
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy.exc import SQLAlchemyError
 
 from service.app import create_app
 from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.storage.database.engine import FILE
-from service.storage.storage import HomeError, check_home
+from service.storage.storage import HomeError, check_home, explain_home_errors
 from tests.attack.attacked import AttackedService, attack_random, query
 from tests.service.data import ADDRESS, eventually, stream, upload
 from tests.system.faults.ledger import ARM, QUERIES, batch, predict_queries, query_rows
@@ -75,9 +77,11 @@ def flip_page(path: Path, page: int, random: Random) -> None:
 
 def damages_of(home: Path) -> list[str]:
     """Return what `lipserve verify` reports; an unreadable database counts as one damage."""
+    settings = Settings(home=home)
     try:
-        return [str(each) for each in verify_home(Settings(home=home)).damages]
-    except Exception as error:  # the command explains any error of the database
+        with explain_home_errors(settings):  # as the command does
+            return [str(each) for each in verify_home(settings).damages]
+    except HomeError as error:
         return [f"database: {error}"]
 
 
@@ -139,7 +143,9 @@ def test_no_damaged_database_page_leads_to_a_wrong_answer(used_home, tmp_path):
             codes = check_answers(home, used_home)
         except AssertionError as error:
             wrong.append(f"page {page}: {error}")
-        except Exception as error:  # the service does not start
+        except (SQLAlchemyError, JSONDecodeError) as error:
+            wrong.append(f"page {page}: {error!r} instead of advice")
+        except Exception as error:  # a readable text with other contents: the service does not start
             codes = {repr(error)}
         if codes - {"no_serving_version", "not_found"} and not found:
             wrong.append(f"page {page}: {codes}, but verify reports nothing")

@@ -26,6 +26,7 @@ from lipcore.files.durable import make_folder
 from service.foundation.settings import CONNECTIONS, Settings
 from service.storage.database import tables
 from service.storage.database.migrations import migrate
+from service.storage.database.texts import find_unreadable_texts
 
 if TYPE_CHECKING:
     from service.storage.database.postgresql import Postgresql
@@ -108,11 +109,11 @@ class Sqlite:
         self.engine.dispose()
 
     def damage(self) -> list[str]:
-        """Return the faults that `quick_check` finds; takes about 0.3 s per GB."""
+        """Return the first fault of pages or texts; takes about 0.5 s per GB, and 4 µs per batch of the log."""
         return self._faults("quick_check", 1)
 
     def inconsistencies(self, most: int) -> list[str]:
-        """Return the faults of `integrity_check` and broken references; takes several times as long as `damage`."""
+        """Return broken references, and the faults of `integrity_check` or unreadable texts; slower than `damage`."""
         with self.engine.connect() as connection:
             rows = list(connection.execute(text("PRAGMA foreign_key_check")))
         return [
@@ -123,7 +124,7 @@ class Sqlite:
     def _faults(self, check: str, most: int) -> list[str]:
         with self.engine.connect() as connection:
             faults = [str(each) for each in connection.scalars(text(f"PRAGMA {check}({int(most)})"))]
-        return [] if faults == ["ok"] else faults
+            return find_unreadable_texts(connection, most) if faults == ["ok"] else faults
 
 
 def _configure(connection: Any, _: object) -> None:

@@ -113,6 +113,11 @@ PANDA = RobotKind(("a", "b"), ("revolute", "prismatic"), "gravity_included")
             "estimator",
             "as the joints of the base have another order",
         ),
+        (
+            {"arms": 2, "estimator": "rigid-body+lip-chain"},
+            "estimator",
+            "expected auto or rigid-body or rigid-body+local, as the base has 2 arms and rigid-body+lip-chain needs",
+        ),
         ({"robot": "panda"}, "robot", "'panda', expected no robot together with a base"),
         ({"options": FitOptions(geometry="learn")}, "options.geometry", "'learn', expected auto, calibrate or fixed"),
         ({"options": FitOptions(prior="zero")}, "options.prior", "'zero', expected the default"),

@@ -130,7 +130,7 @@ def test_variables_of_clients_tests_and_kubernetes_are_known():
         "LIPSERVE_DB_SERVICE_PORT": "5432",
         "LIPSERVE_DB_PORT": "tcp://…",
     }
-    assert check_environment({"LIPSERVE_URL": "", "LIPSERVE_API_KEY": "", "LIPSERVE_SCREENSHOTS": "", **services}) == []
+    assert check_environment({"LIPSERVE_URL": "", "LIPSERVE_API_KEY": "", "LIPSERVE_ATTACK_SEED": "", **services}) == []
     del services["LIPSERVE_DB_SERVICE_HOST"]
     with pytest.raises(ValueError, match="LIPSERVE_DB_PORT"):
         check_environment(services)

@@ -12,14 +12,14 @@ from unittest.mock import patch
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import create_engine, event, text
+from sqlalchemy import JSON, String, create_engine, event, text
 from sqlalchemy.exc import DBAPIError
 
 from service.app import create_app
 from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.learning.weigher.weighing import Weighing
-from service.storage.database import Database
+from service.storage.database import Base, Database
 from service.storage.database.engine import FILE
 from service.storage.errors import translate_error
 from service.storage.files import Files
@@ -43,7 +43,9 @@ def statement_error(path: Path, *statements: str, mode: str = "rwc") -> DBAPIErr
     def run() -> None:
         with engine.connect() as connection:
             for statement in statements:
-                connection.execute(text(statement))
+                result = connection.execute(text(statement))
+                if result.returns_rows:
+                    result.all()
 
     with pytest.raises(DBAPIError) as found:
         run()
@@ -75,6 +77,10 @@ def no_database_error(path: Path) -> DBAPIError:
     return statement_error(path, SELECT)
 
 
+def undecodable_error(path: Path) -> DBAPIError:
+    return statement_error(path, "UPDATE t SET x = CAST(x'ff' AS TEXT)", "SELECT x FROM t")
+
+
 def full_error(path: Path) -> DBAPIError:
     return statement_error(path, "PRAGMA max_page_count = 3", "INSERT INTO t VALUES (zeroblob(100000))")
 
@@ -86,6 +92,7 @@ def full_error(path: Path) -> DBAPIError:
         (full_error, StorageFullError, "full"),
         (damaged_error, StorageUnavailableError, "damaged"),
         (no_database_error, StorageUnavailableError, "damaged"),
+        (undecodable_error, StorageUnavailableError, "damaged"),
         (lambda path: statement_error(path, INSERT, mode="ro"), StorageUnavailableError, "readonly"),
         (lambda path: statement_error(path.parent, SELECT), StorageUnavailableError, "unable to open"),
         (lambda path: statement_error(path, "INSERT INTO t VALUES (1)"), None, ""),
@@ -208,6 +215,32 @@ def test_service_does_not_start_on_a_later_database(tmp_path):
         session.execute(text("UPDATE alembic_version SET version_num = '9999'"))
     database.close()
     with pytest.raises(HomeError, match=r"a later release of LIPServe has used it"):
+        check_home(Settings(home=tmp_path))
+
+
+def test_unreadable_texts_are_found(tmp_path):
+    """One after the other, each text column of each table has a byte that is not UTF-8, or a number that JSON lacks."""
+    database = Database(tmp_path)
+    with closing(sqlite3.connect(tmp_path / FILE, isolation_level=None)) as other:
+        other.execute("PRAGMA synchronous = OFF")
+        other.execute("DROP TRIGGER audit_kept")
+        for table in Base.metadata.sorted_tables:
+            texts = [each for each in table.columns if isinstance(each.type, (String, JSON))]
+            values = ", ".join("'[0]'" if each in texts else "0" for each in table.columns)
+            other.execute(f"INSERT INTO {table} VALUES ({values})")
+            for column in texts:
+                for content in (b"[\xff]", b"[01]") if isinstance(column.type, JSON) else (b"[\xff]",):
+                    other.execute(f'UPDATE {table} SET "{column.name}" = CAST(? AS TEXT)', (content,))
+                    (fault,) = database.adapter.damage()
+                    assert f"`{column.name}` of row" in fault
+                    assert f"of the table {table} cannot be read" in fault
+                other.execute(f"UPDATE {table} SET \"{column.name}\" = '[NaN, -Infinity]'")
+        assert database.adapter.damage() == []
+        other.execute("UPDATE versions SET manifest = CAST(x'ff' AS TEXT)")
+    database.close()
+    with pytest.raises(
+        HomeError, match=r"`manifest` of row .* of the table versions cannot be read: .*restore a backup"
+    ):
         check_home(Settings(home=tmp_path))
 
 

@@ -72,3 +72,7 @@ def test_what_needs_one_arm_says_so(arms):
     assert "one arm of at least 6 joints" in error(answer, 422, "invalid_request")["message"]
     request = {"model": MODEL, "datasets": [], "options": {"arms": "3"}}
     assert error(arms.client.post("/v1/jobs/check", json=request), 422, "invalid_request")
+    dataset = arms.client.get("/v1/datasets").json()["items"][0]["id"]
+    request = {"model": "unit", "datasets": [dataset], "base": f"{MODEL}:1", "joint_types": list(TYPES)}
+    answer = arms.client.post("/v1/jobs/check", json=request | {"estimator": "rigid-body+lip-chain"})
+    assert "the base has 2 arms" in error(answer, 422, "invalid_request")["message"]

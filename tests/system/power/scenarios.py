@@ -224,13 +224,17 @@ class RecordedService:
         return version
 
     def import_version(self, model: str, version: int) -> None:
-        """Import a version as the next one of a model; it becomes a candidate."""
+        """Import a version as the next one of a model; the first one serves."""
         with self.client.stream("GET", f"/v1/models/{ARM}/export", params={"version": 1, "learnt": False}) as answer:
             archive = answer.read()
-        with self.recorded_request("publication", **{f"version/{model}/{version}": ANY}) as acknowledged:
+            assert answer.is_success, archive
+        made, serving = f"version/{model}/{version}", f"alias/{model}/serving"
+        with self.recorded_request("publication", **{made: ANY, serving: ANY}) as acknowledged:
             answer = self._post("/v1/models/import", MEDIA_TYPE, archive, name=model)
             assert answer["version"] == version
-            acknowledged[f"version/{model}/{version}"] = answer["created_at"]
+            acknowledged[made] = answer["created_at"]
+            acknowledged[serving] = self._check_success(self.client.get(f"/v1/models/{model}"))["serving_version"]
+            assert version > 1 or acknowledged[serving] == 1
 
     def delete_version(self, model: str, version: int) -> None:
         """Delete a version."""
@@ -239,7 +243,8 @@ class RecordedService:
 
     def delete_model(self, model: str, version: int) -> None:
         """Delete a model that has one version."""
-        with self.recorded_request("publication", **{f"version/{model}/{version}": None}):
+        gone = {f"version/{model}/{version}": None, f"alias/{model}/serving": None}
+        with self.recorded_request("publication", **gone):
             self._check_success(self.client.delete(f"/v1/models/{model}"))
 
     def make_key(self, name: str) -> None:

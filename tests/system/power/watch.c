@@ -175,6 +175,21 @@ static off_t place(int file, const struct stat *about) {
   return fcntl(file, F_GETFL) & O_APPEND ? about->st_size : lseek(file, 0, SEEK_CUR);
 }
 
+/* Closing: a confined reader closes all files that it does not need, but its changes are recorded, too */
+
+EXPORT int close(int file) {
+  REAL("close", int, int);
+  return file >= 0 && file == record_file ? 0 : real(file);
+}
+
+EXPORT int close_range(unsigned first, unsigned last, int flags) {
+  unsigned kept = (unsigned)record_file;
+  REAL("close_range", int, unsigned, unsigned, int);
+  if (record_file < 0 || kept < first || kept > last) return real(first, last, flags);
+  int below = kept > first ? real(first, kept - 1, flags) : 0, above = kept < last ? real(kept + 1, last, flags) : 0;
+  return below ? below : above;
+}
+
 /* Opening */
 
 static int opened(int folder, const char *path, int flags, mode_t mode) {
