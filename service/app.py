@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -91,6 +92,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
         webhook = Webhook(storage.database, settings)
         _share(app, storage, jobs, learners, webhook)
+        loop = asyncio.get_running_loop()
+
+        def forget(model: str) -> None:
+            loop.call_soon_threadsafe(meters.forget, model)  # only the loop changes the meters
+
+        learners.loaded.when_deleted.append(forget)
         stop_following = storage.database.follow_others(lambda: Replication(learners).close)
         try:
             async with AsyncExitStack() as serving:

@@ -22,7 +22,7 @@ BUCKET_BOUNDS_S = (
 """Upper bounds of durations, s: from a frame of a stream to a large upload."""
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "PATCH", "OPTIONS", "WEBSOCKET"})
 OTHER = "other"
-"""Label of unknown methods, and of models beyond `MAX_MODELS`."""
+"""Label of unknown methods, of deleted models, and of models beyond `MAX_MODELS`."""
 MAX_MODELS = 200
 """Max models with labels of their own in metrics of requests and streams; the others are counted together."""
 
@@ -40,6 +40,11 @@ class Durations:
         """Count one duration."""
         self.counts[bisect_left(self.bounds, seconds)] += 1
         self.total += seconds
+
+    def merge(self, other: Durations) -> None:
+        """Add the durations of a histogram with the same bounds."""
+        self.counts = [ours + theirs for ours, theirs in zip(self.counts, other.counts, strict=True)]
+        self.total += other.total
 
 
 class Kind(NamedTuple):
@@ -86,6 +91,13 @@ class RequestMeter:
         self._models.add(model)
         return model
 
+    def forget(self, model: str) -> None:
+        """Count the requests of a deleted model with those of OTHER, so that their number does not fall."""
+        self._models.discard(model)
+        for key in [key for key in self.known if key[2] == model]:
+            durations = self.known.pop(key)
+            self.known.setdefault(Kind(*key)._replace(model=OTHER), Durations()).merge(durations)
+
 
 class StreamMeter:
     """Frames of the streams of one model.
@@ -116,6 +128,16 @@ class Meters:
     def stream(self, model: str) -> StreamMeter:
         """Return the meter of an existing model's streams."""
         return self._streams.setdefault(self.requests.label(model), StreamMeter())
+
+    def forget(self, model: str) -> None:
+        """Count requests and frames of a deleted model with those of OTHER. Call it in the event loop."""
+        self.requests.forget(model)
+        if (meter := self._streams.pop(model, None)) is not None:
+            rest = self._streams.setdefault(OTHER, StreamMeter())
+            rest.durations.merge(meter.durations)
+            rest.late += meter.late
+            for code, count in meter.refused.items():
+                rest.refused[code] = rest.refused.get(code, 0) + count
 
     def streams(self) -> Mapping[str, StreamMeter]:
         """Return a copy of the meters of streams by model."""
@@ -169,8 +191,7 @@ def merge_durations(parts: Iterable[Durations]) -> Durations:
     """Return the sum of the durations of several meters."""
     total = Durations()
     for part in parts:
-        total.counts = [ours + theirs for ours, theirs in zip(total.counts, part.counts, strict=True)]
-        total.total += part.total
+        total.merge(part)
     return total
 
 

@@ -34,6 +34,21 @@ def test_models_beyond_the_max_share_a_label_of_requests_and_streams():
     assert set(meters.streams()) == {"a", OTHER}
 
 
+def test_deleted_models_share_a_label_and_make_room_for_others():
+    meters = Meters(most_models=2)
+    for name in ("kept", "gone", "beyond"):
+        meters.requests.find(Kind("GET", "/r", name, 200, ""), exists=True).add(0.1)
+    meters.stream("gone").late += 3
+    meters.stream("gone").refuse("invalid_request")
+    meters.forget("gone")
+    meters.forget("unknown")
+    assert {kind[2]: sum(each.counts) for kind, each in meters.requests.known.items()} == {"kept": 1, OTHER: 2}
+    assert {name: (each.late, each.refused) for name, each in meters.streams().items()} == {
+        OTHER: (3, {"invalid_request": 1})
+    }
+    assert [meters.requests.label(name) for name in ("new", "gone")] == ["new", OTHER]
+
+
 @pytest.fixture
 def stream_session():
     return make_session(FakeVersions(v1=FakeModel()), 1)[0]
