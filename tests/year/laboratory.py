@@ -22,6 +22,7 @@ from tests.service.server import Server
 from tests.system.histories.clock import Clock
 from tests.year.ledger import DAY_S, Ledger
 from tests.year.robots import ARMS, BATCHES, ESTIMATORS, VISCOUS, Robot
+from tests.year.sizes import measure
 
 OLD_HOME = Path(__file__).parents[1] / "system" / "upgrades" / "home-0.2.0.tar.xz"
 OLD_MODELS = ("chain", "bodies")
@@ -55,6 +56,8 @@ class Laboratory:
         self.home, self.clock, self.ledger = folder / "home", Clock(folder / "clock"), Ledger()
         self.random, self.day, self.guests, self.datasets = Random(seed), 0, 0, dict[str, list[str]]()
         self.spent = Counter[str]()
+        self.temporary = folder / "temporary"
+        self.temporary.mkdir()
         with tarfile.open(OLD_HOME) as tar:
             unpack(tar, self.home)
         names = [*OLD_MODELS, *(f"arm-{number:02}" for number in range(len(OLD_MODELS), robots))][:robots]
@@ -75,7 +78,8 @@ class Laboratory:
 
     def start(self) -> None:
         """Start the service on its home."""
-        self.server = Server(self.home, module="tests.year.serving", **{**SETTINGS, **self.clock.environment})
+        environment = {**SETTINGS, **self.clock.environment, "TMPDIR": str(self.temporary)}
+        self.server = Server(self.home, module="tests.year.serving", **environment)
         self.client = self.server.client
         self.client.event_hooks["response"].append(self.ledger.note_answer)
 
@@ -167,9 +171,14 @@ class Laboratory:
         assert answer.status_code == httpx.codes.OK
         return answer.text
 
-    def count(self) -> dict[str, float]:
-        """Return the numbers with which sizes may grow, see `tests.year.sizes`."""
-        return {"acknowledged rows": self.ledger.rows, "deleted models": self.guests, "requests": self.ledger.requests}
+    def measure(self) -> dict[str, float]:
+        """Return the sizes of the service, and the numbers with which they may grow, see `tests.year.sizes`."""
+        counts = {
+            "acknowledged rows": self.ledger.rows,
+            "deleted models": self.guests,
+            "requests": self.ledger.requests,
+        }
+        return measure(self.home, self.temporary, self.server.process.pid, self.server.log, self.metrics()) | counts
 
     def check_counters(self) -> None:
         """Compare the counters of /metrics with the ledger."""

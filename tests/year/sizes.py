@@ -57,12 +57,15 @@ def bound_of(name: str) -> Bound:
     return GROWS[name][0] if name in GROWS else ("models" if name in OF_MODELS else "retention")
 
 
-def measure(home: Path, pid: int, log: Path, metrics: str) -> dict[str, float]:
-    """Return every size of a service: rows and bytes of tables, files, processes, series."""
+def measure(home: Path, temporary: Path, pid: int, log: Path, metrics: str) -> dict[str, float]:
+    """Return every size of a service: rows and bytes of tables, files, processes, series.
+
+    temporary: folder of its temporary files.
+    """
     found: dict[str, float] = {f"bytes in table {name}": size for name, size in query_rows(home, BYTES)}
     for (table,) in query_rows(home, TABLES):
         found[f"rows in table {table}"] = query_rows(home, f'SELECT count(*) FROM "{table}"')[0][0]
-    for folder in sorted(each for each in home.iterdir() if each.is_dir()):
+    for folder in (temporary, *(each for each in home.iterdir() if each.is_dir())):
         files = [each for each in folder.rglob("*") if each.is_file()]
         found[f"files in {folder.name}/"] = len(files)
         found[f"bytes in {folder.name}/"] = sum(_size(each) for each in files)

@@ -62,6 +62,7 @@ def test_wrong_counters_are_found():
     [
         ("DELETE FROM events WHERE number = 9", r"\('arm', 's', 9\) of 86400 s is lost"),
         ("DELETE FROM events WHERE number = 1", None),  # older than the retention
+        ("DELETE FROM events WHERE number = 2", r"\('arm', 's', 2\) of 691200 s is lost"),  # but a later one
         ("UPDATE events SET rows = 4 WHERE number = 9", r"\('arm', 's', 9\)"),
         ("UPDATE events SET void = 1 WHERE number = 9", r"\('arm', 's', 9\)"),
         ("UPDATE events SET sequence = 70 WHERE number = 9", r"\('arm', 's', 9\) of 86400 s is lost"),

@@ -17,7 +17,7 @@ import pytest
 from tests.system.histories.clock import Clock
 from tests.year.happenings import OTHERS, RESTARTS
 from tests.year.laboratory import Laboratory
-from tests.year.sizes import find_growth, format_table, measure
+from tests.year.sizes import find_growth, format_table
 
 DAYS, ROBOTS = int(os.environ.get("LIPSERVE_YEAR_DAYS", "30")), int(os.environ.get("LIPSERVE_YEAR_ROBOTS", "3"))
 SEED = int(os.environ.get("LIPSERVE_YEAR_SEED", str(time.time_ns() % 10**6)))
@@ -51,8 +51,7 @@ def test_year_leaves_no_trace(tmp_path: Path) -> None:
                 if lab.day % PERIOD == 0:
                     lab.settle()
                     days.append(lab.day)
-                    sizes = measure(lab.home, lab.server.process.pid, lab.server.log, lab.metrics())
-                    periods.append(sizes | lab.count())
+                    periods.append(lab.measure())
                 if lab.day % CHECK == 0 or lab.day == DAYS:
                     lab.check()
         finally:
