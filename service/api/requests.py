@@ -214,7 +214,7 @@ def _exists(scope: Scope, model: str, method: str, status: int) -> bool:
 
     A request that deletes, or a stream, may outlive its model.
     """
-    if status < 400 and method not in ("DELETE", WEBSOCKET):
+    if not model or (status < 400 and method not in ("DELETE", WEBSOCKET)):
         return True
     loaded = getattr(scope["app"].state, "loaded", None)
     return loaded is not None and loaded.newest(model) is not None

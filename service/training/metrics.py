@@ -44,7 +44,7 @@ class JobMetrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
-        with self._database.session() as session:
+        with self._database.moment() as session:  # jobs are deleted and tallied meanwhile
             states, finished, durations = _counts(session), count_jobs(session), read_durations(session)
         yield self.jobs.of(([state], states.get(state, 0)) for state in ACTIVE)
         yield self.finished.of(([outcome], count) for outcome, count in finished.items())
