@@ -14,11 +14,14 @@ from typing import Any, Self
 
 import httpx
 
+from lipserve.states import ACTIVE
 from service.cli.verify import verify_home
 from service.foundation.settings import Settings
+from service.training.ended import OUTCOMES
 from tests import unpack
 from tests.service.data import ended, eventually, stream, upload
 from tests.service.server import Server
+from tests.system.faults.ledger import list_items
 from tests.system.histories.clock import Clock
 from tests.year.ledger import DAY_S, Ledger
 from tests.year.robots import ARMS, BATCHES, ESTIMATORS, VISCOUS, Robot
@@ -45,17 +48,22 @@ SETTINGS = {
 }
 
 
+class _PatientServer(Server):
+    patience = 1800.0
+
+
 class Laboratory:
     """A service on a home of release 0.2.0, and robots that send their rows to it; a context manager.
 
     day: number of days that have passed. guests: number of models that were made and deleted. datasets: ids of the
-    uploaded data sets of each model. spent: seconds spent on each kind of happening.
+    uploaded data sets of each model. jobs: states of all jobs ever listed. spent: seconds spent on each kind of
+    happening.
     """
 
     def __init__(self, folder: Path, robots: int, seed: int) -> None:
         self.home, self.clock, self.ledger = folder / "home", Clock(folder / "clock"), Ledger()
         self.random, self.day, self.guests, self.datasets = Random(seed), 0, 0, dict[str, list[str]]()
-        self.spent = Counter[str]()
+        self.jobs, self.spent = dict[str, str](), Counter[str]()
         self.temporary = folder / "temporary"
         self.temporary.mkdir()
         with tarfile.open(OLD_HOME) as tar:
@@ -63,6 +71,7 @@ class Laboratory:
         names = [*OLD_MODELS, *(f"arm-{number:02}" for number in range(len(OLD_MODELS), robots))][:robots]
         self.robots = [self._make_robot(number, name) for number, name in enumerate(names)]
         self.start()
+        self.has_counted_jobs()
         for robot in self.robots:
             if robot.model not in OLD_MODELS:
                 self.train(robot)
@@ -79,7 +88,7 @@ class Laboratory:
     def start(self) -> None:
         """Start the service on its home."""
         environment = {**SETTINGS, **self.clock.environment, "TMPDIR": str(self.temporary)}
-        self.server = Server(self.home, module="tests.year.serving", **environment)
+        self.server = _PatientServer(self.home, module="tests.year.serving", **environment)
         self.client = self.server.client
         self.client.event_hooks["response"].append(self.ledger.note_answer)
 
@@ -151,15 +160,18 @@ class Laboratory:
 
     def settle(self) -> None:
         """Wait until answers contain everything that is logged, and no job runs."""
-        eventually(lambda: self.request("GET", "/v1/jobs", params={"limit": 100})["items"] and not self._active_jobs())
+        eventually(lambda: self.has_counted_jobs() and set(ACTIVE).isdisjoint(self.jobs.values()))
         for robot in self.robots:
             learning = f"/v1/models/{robot.model}/learning"
             eventually(lambda path=learning: self.request("GET", path)["status"]["lag_events"] == 0)
         eventually(self.is_ready)
 
-    def _active_jobs(self) -> list[str]:
-        items = self.request("GET", "/v1/jobs", params={"limit": 100})["items"]
-        return [each["id"] for each in items if each["state"] in ("queued", "running")]
+    def has_counted_jobs(self) -> bool:
+        """List the jobs; return whether /metrics counts all that ever ended, also deleted ones."""
+        self.jobs |= {each["id"]: each["state"] for each in list_items(self.client, "/v1/jobs")}
+        states = Counter(self.jobs.values())
+        lines = [f'lipserve_jobs_finished_total{{outcome="{each}"}} {states[each]}.0' for each in OUTCOMES]
+        return set(lines) <= set(self.metrics().splitlines())
 
     def is_ready(self) -> bool:
         """Return whether every part of the service works."""
