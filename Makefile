@@ -10,7 +10,7 @@ TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test warm-lip warm-chain bytecode test-all nightly screenshots fuzz fuzz-long cpp lint install install-all serve image image-serve docs dist sbom clean
+.PHONY: demo test warm-lip warm-chain bytecode test-all nightly year screenshots fuzz fuzz-long cpp lint install install-all serve image image-serve docs dist sbom clean
 
 demo: $(VENV)/.running
 	$(BIN)/lipserve demo
@@ -55,6 +55,12 @@ test-all: install-all
 # all tests, with histories of ten minutes
 nightly:
 	$(MAKE) test-all HISTORY_S=600
+
+# a simulated year of twenty robots, about four hours; `make test-all` runs a month of three
+YEAR_DAYS ?= 365
+YEAR_ROBOTS ?= 20
+year: install-all
+	LIPSERVE_YEAR_DAYS=$(YEAR_DAYS) LIPSERVE_YEAR_ROBOTS=$(YEAR_ROBOTS) $(TEST) -s tests/year/test_year.py
 
 # screenshots of the dashboard for README and guide; `pytest tests/system/browser/test_pages.py --pictures FOLDER` takes one of
 # every page

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from functools import partial
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
@@ -45,21 +46,24 @@ from service.api.shared import Shared
 from service.api.stream import routes as stream
 from service.foundation.settings import Settings
 from service.foundation.text import counted
+from service.journal import alarms
 from service.journal.webhook import Webhook
 from service.learning import friction, refresh
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.metrics import LearningCollector
-from service.models import deletion, shipped
+from service.models import aliases, deletion, shipped
 from service.models.loaded import LoadedModels
 from service.replication import Replication
 from service.runtime.confinement import protections
+from service.runtime.hourly import run_hourly
 from service.runtime.process import SERVING_THREADS
-from service.storage.audit import clean_hourly
+from service.storage import audit as audit_log
 from service.storage.files.store import start_sweeping
 from service.storage.storage import Storage, lock_home
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import Probe, Readiness, StopState
+from service.training import ended
 from service.training.metrics import JobMetrics, check_queue
 from service.training.queue import JobQueue, queue_of
 
@@ -92,12 +96,13 @@ def create_app(settings: Settings | None = None, shared: Shared | None = None) -
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
         webhook = Webhook(storage.database, settings)
         _share(app, storage, jobs, learners, webhook, shared)
+        learners.loaded.when_deleted.append(meters.forget)
         stop_following = storage.database.follow_others(lambda: Replication(learners).close)
         try:
             async with AsyncExitStack() as serving:
                 if keyring is not None:
                     await serving.enter_async_context(keyring.watching(storage.database))
-                await serving.enter_async_context(clean_hourly(storage.database, settings))
+                await serving.enter_async_context(run_hourly(_chores(storage, learners)))
                 if calls:
                     await serving.enter_async_context(_calls(app, settings, stopping, shared))
                 webhook.start()
@@ -223,6 +228,18 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     refresh.attach(learners, jobs)
     friction.attach(learners)
     return storage, jobs, learners
+
+
+def _chores(storage: Storage, learners: Learners) -> dict[str, Callable[[], object]]:
+    """Return the functions that delete what is too old, by what they delete."""
+    cleaners = {
+        "lines of the audit log": audit_log.clean,
+        "alarms": alarms.clean,
+        "moves of aliases": aliases.clean,
+        "jobs": ended.clean,
+    }
+    cleaned = {name: partial(clean, storage.database, storage.settings) for name, clean in cleaners.items()}
+    return {**cleaned, "observations": learners.retain}
 
 
 def _share(

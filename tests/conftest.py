@@ -30,7 +30,7 @@ settings.register_profile("lipserve", derandomize=True, deadline=None, max_examp
 settings.register_profile("thorough", settings.get_profile("lipserve"), max_examples=100)  # of `make test-all`
 settings.load_profile("lipserve")
 
-SYSTEM = ("tests/system/", "tests/attack/", "tests/clients/cpp/", "tests/clients/ros2/")
+SYSTEM = ("tests/system/", "tests/attack/", "tests/year/", "tests/clients/cpp/", "tests/clients/ros2/")
 """Folders of tests with real services, browsers, compilers, PostgreSQL, Dask and power cuts.
 
 `make test` runs their tests with the marker `journey`, `make test-all` runs all.

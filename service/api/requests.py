@@ -183,7 +183,7 @@ class RequestContext:
         kind = (method, path, model, status, scope.get(ERROR_CODE, ""))
         durations = self.known.get(kind)
         if durations is None:
-            durations = self.requests.find(Kind(*kind), status < 400 or _exists(scope, model))
+            durations = self.requests.find(Kind(*kind), _exists(scope, model, method, status))
         durations.add(answered - began)
         if status >= 400 or self.log.may_log(method, path, seconds):
             self.log.log_end(scope, Kind(*kind), seconds)
@@ -214,7 +214,12 @@ def _template(scope: Scope) -> str:
     return path
 
 
-def _exists(scope: Scope, model: str) -> bool:
-    """Return whether the model of a refused request is known. Models not used since the start are unknown."""
+def _exists(scope: Scope, model: str, method: str, status: int) -> bool:
+    """Return whether the model of an answered request exists. Of a refused one, it must have been used since the start.
+
+    A request that deletes, or a stream, may outlive its model.
+    """
+    if not model or (status < 400 and method not in ("DELETE", WEBSOCKET)):
+        return True
     loaded = getattr(scope["app"].state, "loaded", None)
     return loaded is not None and loaded.newest(model) is not None

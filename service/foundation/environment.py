@@ -12,7 +12,8 @@ OTHER_VARIABLES = frozenset(
         *("URL", "API_KEY"),  # read by clients
         "PUBLISH",  # read by compose.yaml
         *("AXE", "CHROMIUM", "SCREENSHOTS", "HISTORY_S", "HISTORY_SEED", "POWER_CUTS", "POWER_SEED"),  # read by tests
-        *("ATTACK_SEED", "FAULT_FILE", "FAULT_TARGETS", "TEST_HIDDEN"),
+        *("ATTACK_SEED", "YEAR_DAYS", "YEAR_ROBOTS", "YEAR_SEED"),
+        *("FAULT_FILE", "FAULT_TARGETS", "TEST_HIDDEN"),
     }
 )
 """Known variables that are no settings of the service, without the prefix."""

@@ -220,7 +220,11 @@ class Settings(BaseSettings):
     min_free_bytes: Annotated[int, Field(ge=0), Unit("bytes")] = Field(
         64 * MiB, description="Space that stays free on the disk of the home."
     )
-    audit_retention_s: Seconds = Field(365 * 86400.0, description="Age up to which the audit log is kept.")
+    audit_retention_s: Seconds = Field(
+        365 * 86400.0,
+        description="Age up to which the audit log, alarms, ended jobs and moves of aliases are kept. The jobs of "
+        "existing versions and the last 20 moves of an alias stay.",
+    )
     observation_retention_bytes: Bytes = Field(
         1024 * MiB, description="Size up to which the observations of a model are kept."
     )

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from typing import Any, Literal
 
-from sqlalchemy import delete
+from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from service.contract.learning import AlarmKind
-from service.storage.database import AlarmEventRow, AlarmRow, now
+from service.foundation.settings import Settings
+from service.storage.audit import oldest_kept
+from service.storage.database import AlarmEventRow, AlarmRow, Database, now
 from service.storage.files import new_id
 from service.storage.rows import Page, read_page
 
@@ -46,3 +48,13 @@ def add_event(
 def page(session: Session, model: str, part: Page) -> tuple[list[AlarmRow], str | None]:
     """Return the alarms of a page, read_page first, and the cursor after the page."""
     return read_page(session, AlarmRow, part, AlarmRow.model == model)
+
+
+def clean(database: Database, settings: Settings) -> int:
+    """Delete the alarms older than the lines of the audit log that are kept; return their number."""
+    too_old = AlarmRow.at < oldest_kept(settings)
+    with database.session() as session:  # a transaction would block other writers
+        if session.scalar(select(AlarmRow.seq).where(too_old).limit(1)) is None:
+            return 0
+    with database.transaction() as session:
+        return len(session.execute(delete(AlarmRow).where(too_old).returning(AlarmRow.seq)).all())

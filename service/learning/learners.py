@@ -30,7 +30,7 @@ from service.learning.learner.process import LearnerProcess
 from service.learning.learner.publication import LearningFailure, Message, Publication
 from service.learning.live.feed import Feed
 from service.models.loaded import LoadedModels, ServedModel
-from service.storage.database import StreamRow
+from service.storage.database import ModelRow, StreamRow
 from service.telemetry.readiness import FaultAge
 
 logger = logging.getLogger(__name__)
@@ -208,6 +208,17 @@ class Learners:
                 fresh[model] = self._monitor(served)
                 self._log.follow(fresh[model], model)
         return dict(sorted((self.monitors() | fresh).items()))
+
+    def retain(self) -> None:
+        """Delete the observations of all models beyond the limits, and silent streams. Blocking: use it in a thread.
+
+        Batches do this too, but a model may receive none for long, or few between two starts of the service.
+        """
+        with self.database.session() as session:
+            logged = list(session.scalars(select(ModelRow.name)))
+        known = self.monitors()
+        for model in logged:
+            self._log.retain(model, known.get(model))
 
     def forget(self, model: str) -> None:
         """Delete everything about a model that has been deleted."""

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from sqlalchemy import select
-from sqlalchemy.orm import Session
+from sqlalchemy import delete, func, select
+from sqlalchemy.orm import Session, aliased
 
 from lipcore.estimators.base import RobotKind
 from service.contract.models import Alias, AliasList, AliasMove, AliasRequest
 from service.foundation.errors import ConflictError, invalid_request, not_found
+from service.foundation.settings import Settings
 from service.models import registry, texts, verdicts
 from service.models.loaded import LoadedModels
 from service.models.registry import CANDIDATE, SERVING
-from service.storage.database import AliasMoveRow, AliasRow, ServingRow, VersionRow, now
+from service.storage.audit import oldest_kept
+from service.storage.database import AliasMoveRow, AliasRow, Database, ServingRow, VersionRow, now
+
+KEPT_MOVES = 20
+"""Moves of an alias that are listed, and kept whatever their age."""
 
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
@@ -159,6 +164,23 @@ def _check_model(session: Session, model: str) -> None:
         raise not_found("model", model)
 
 
+def clean(database: Database, settings: Settings) -> int:
+    """Delete the moves older than the lines of the audit log that are kept, but for the last `KEPT_MOVES` of an alias.
+
+    Return their number.
+    """
+    newer = aliased(AliasMoveRow)
+    same = (newer.model == AliasMoveRow.model, newer.alias == AliasMoveRow.alias, newer.seq > AliasMoveRow.seq)
+    later = select(func.count()).where(*same).correlate(AliasMoveRow).scalar_subquery()
+    query = select(AliasMoveRow.seq).where(AliasMoveRow.at < oldest_kept(settings), later >= KEPT_MOVES)
+    with database.session() as session:  # a transaction would block other writers
+        old = list(session.scalars(query))
+    if old:
+        with database.transaction() as session:
+            session.execute(delete(AliasMoveRow).where(AliasMoveRow.seq.in_(old)))
+    return len(old)
+
+
 def names(session: Session, model: str) -> list[str]:
     """Return the aliases of a model except `serving`, in alphabetical order."""
     return list(session.scalars(select(AliasRow.alias).where(AliasRow.model == model).order_by(AliasRow.alias)))
@@ -171,7 +193,7 @@ def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) 
 
 
 def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:
-    past = _history(session, model, alias, 20)
+    past = _history(session, model, alias, KEPT_MOVES)
     if alias == SERVING:
         version = session.get_one(ServingRow, model).version
         changed_at = past[0].at if past else session.get_one(VersionRow, (model, version)).created_at

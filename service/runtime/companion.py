@@ -225,7 +225,7 @@ class Companion:
 def receive_work(connection: Connection, seconds: float) -> Work | None:
     """Return the work that arrives within `seconds`; None if the process has to end. Called in the companion process.
 
-    Raise EOFError if the service is gone.
+    Raise EOFError or ConnectionError if the service is gone.
     """
     work: Work = {}
     while connection.poll(seconds):

@@ -6,14 +6,9 @@ deleted when it is older than `LIPSERVE_AUDIT_RETENTION_S`.
 
 from __future__ import annotations
 
-import asyncio
-import logging
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from anyio import to_thread
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
@@ -22,8 +17,6 @@ from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, AuditRow, Database, JobRow, now
 from service.storage.rows import Page, read_page
 from service.telemetry.logs import KEY_ID, job_id, request_id, request_scope
-
-logger = logging.getLogger(__name__)
 
 SERVICE = "service"
 """Replaces the route if no request made the change: a version shipped with LIPServe, or an automatic promotion."""
@@ -86,33 +79,17 @@ def _text(moment: datetime) -> str:
     return moment.astimezone(UTC).isoformat(timespec="milliseconds")
 
 
+def oldest_kept(settings: Settings) -> str:
+    """Return the time of the oldest lines that are kept, ISO 8601 in UTC."""
+    return _text(datetime.now(UTC) - timedelta(seconds=settings.audit_retention_s))
+
+
 def clean(database: Database, settings: Settings) -> int:
     """Delete lines older than the retention setting; return their number."""
-    oldest = datetime.now(UTC) - timedelta(seconds=settings.audit_retention_s)
-    too_old = AuditRow.at < _text(oldest)
+    too_old = AuditRow.at < oldest_kept(settings)
     with database.session() as session:
         if session.scalar(select(AuditRow.seq).where(too_old).limit(1)) is None:
             return 0
     with database.transaction() as session:
         gone = session.execute(delete(AuditRow).where(too_old).returning(AuditRow.seq))
         return len(gone.all())
-
-
-@asynccontextmanager
-async def clean_hourly(database: Database, settings: Settings) -> AsyncIterator[None]:
-    """Delete old lines every hour during the block."""
-    task = asyncio.create_task(_clean(database, settings))
-    try:
-        yield
-    finally:
-        task.cancel()
-        await asyncio.wait((task,))
-
-
-async def _clean(database: Database, settings: Settings) -> None:
-    while True:
-        await asyncio.sleep(3600.0)  # wait first, so that a host with a wrong clock at its start has corrected it
-        try:
-            await to_thread.run_sync(clean, database, settings)
-        except Exception as error:
-            logger.warning("could not delete old lines of the audit log: %s", error)

@@ -7,6 +7,7 @@ families and its line in the documentation.
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -16,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from service.telemetry.counters import Counters, Counts, Reals, Tally
+from service.telemetry.counters import Counters, Counts, Name, Reals, Tally, new_tally
 
 BUCKET_BOUNDS_S = (
     *(0.000_05, 0.000_1, 0.000_25, 0.000_5, 0.001, 0.002, 0.005, 0.01, 0.025),
@@ -25,7 +26,7 @@ BUCKET_BOUNDS_S = (
 """Upper bounds of durations, s: from a frame of a stream to a large upload."""
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "PATCH", "OPTIONS", "WEBSOCKET"})
 OTHER = "other"
-"""Label of unknown methods, and of models beyond `MAX_MODELS`."""
+"""Label of unknown methods, of deleted models, and of models beyond `MAX_MODELS`."""
 MAX_MODELS = 200
 """Max models with labels of their own in metrics of requests and streams; the others are counted together."""
 
@@ -103,6 +104,8 @@ class RequestMeter:
         if not model or model in self._models:
             return model
         if len(self._models) >= self._most_models:
+            self._models -= {model for (model,) in self._counters.tallies(_DELETED)}
+        if len(self._models) >= self._most_models:
             return OTHER
         self._models.add(model)
         return model
@@ -110,8 +113,8 @@ class RequestMeter:
     def totals(self) -> Mapping[Kind, Durations]:
         """Return the durations of all kinds, of all processes of the service."""
         found: dict[Kind, Durations] = {}
-        for (method, route, model, status, code), tallies in self._counters.tallies(_REQUEST).items():
-            found[Kind(method, route, model, int(status), code)] = _sum_durations(tallies)
+        for (method, route, model, status, code), tally in _totals(self._counters, _REQUEST).items():
+            found[Kind(method, route, model, int(status), code)] = Durations(tally=tally)
         return found
 
 
@@ -175,27 +178,54 @@ class Meters:
             meter = self._streams[label] = StreamMeter(self.counters, label)
         return meter
 
+    def forget(self, model: str) -> None:
+        """Count what was counted for a deleted model with OTHER, so that no sum falls. Only one process may call it."""
+        self.counters.tally(_DELETED, model)
+        for kind, place in _MODEL_PLACES.items():
+            for name, tallies in self.counters.tallies(kind).items():
+                if name[place] == model:
+                    total, moved = _add(*tallies), self.counters.tally(_MOVED + kind, *name)
+                    moved.counts[:] = array("q", total.counts)
+                    moved.reals[:] = array("d", total.reals)
+
     def streams(self) -> Mapping[str, StreamTotals]:
         """Return the totals of streams by model, of all processes of the service."""
-        late, refused = self.counters.tallies(_LATE), defaultdict[str, dict[str, int]](dict)
-        for (model, code), tallies in self.counters.tallies(_REFUSED).items():
-            refused[model][code] = _sum_counts(tallies)
+        late, refused = _totals(self.counters, _LATE), defaultdict[str, dict[str, int]](dict)
+        for (model, code), tally in _totals(self.counters, _REFUSED).items():
+            refused[model][code] = tally.counts[0]
         return {
-            model: StreamTotals(_sum_durations(tallies), _sum_counts(late.get((model,), ())), refused[model])
-            for (model,), tallies in self.counters.tallies(_STREAM).items()
+            model: StreamTotals(Durations(tally=tally), late.get((model,), new_tally()).counts[0], refused[model])
+            for (model,), tally in _totals(self.counters, _STREAM).items()
         }
 
 
-_REQUEST, _STREAM, _LATE, _REFUSED = "request", "stream", "late", "refused"
-"""Kinds of tallies."""
+_REQUEST, _STREAM, _LATE, _REFUSED, _DELETED = "request", "stream", "late", "refused", "deleted model"
+_MODEL_PLACES = {_REQUEST: 2, _STREAM: 0, _LATE: 0, _REFUSED: 0}
+"""Kinds of tallies, and the place of the model in their names."""
+_MOVED = "moved "
+"""Prefix of the kind of a tally that was moved to OTHER: it has the numbers at the time of the deletion."""
 
 
-def _sum_durations(tallies: Iterable[Tally]) -> Durations:
-    return merge_durations(Durations(tally=tally) for tally in tallies)
+def _totals(counters: Counters, kind: str) -> dict[Name, Tally]:
+    """Return the sums over all processes. Those of deleted models are OTHER's; see `Meters.forget`."""
+    place = _MODEL_PLACES[kind]
+    found = {name: _add(*tallies) for name, tallies in counters.tallies(kind).items()}
+    for name, (moved,) in counters.tallies(_MOVED + kind).items():
+        found[name] = _add(found[name], moved, sign=-1)
+        if not any(found[name].counts):
+            del found[name]
+        rest = (*name[:place], OTHER, *name[place + 1 :])
+        found[rest] = _add(found.get(rest, new_tally()), moved)
+    return found
 
 
-def _sum_counts(tallies: Iterable[Tally]) -> int:
-    return sum(tally.counts[0] for tally in tallies)
+def _add(first: Tally, *others: Tally, sign: int = 1) -> Tally:
+    """Return a tally plus others, or minus others."""
+    total = Tally([*first.counts], [*first.reals])
+    for other in others:
+        total.counts = [ours + sign * theirs for ours, theirs in zip(total.counts, other.counts, strict=True)]
+        total.reals = [ours + sign * theirs for ours, theirs in zip(total.reals, other.reals, strict=True)]
+    return total
 
 
 _FAMILIES: dict[str, Any] = {

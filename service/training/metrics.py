@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from datetime import datetime
 
 from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
+from service.contract.states import ACTIVE, QUEUED, RUNNING, PartState
 from service.foundation.text import counted
 from service.storage.database import Database, JobRow
-from service.telemetry.meters import Durations, MetricKind
+from service.telemetry.meters import MetricKind
 from service.telemetry.readiness import FaultAge
+from service.training.ended import count_jobs, read_durations
 from service.training.queue import JobQueue
 
 START_S = 60.0
 """Maximum time to start a job while a training process is free, s."""
 SILENT_S = 10.0
 """Maximum time without a heartbeat from a healthy training process, s; the interval is half a second."""
-OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 
 
 class JobMetrics(Collector):
@@ -45,18 +44,11 @@ class JobMetrics(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
-        with self._database.session() as session:
-            states = _counts(session)
-            ended = select(JobRow.state, JobRow.started_at, JobRow.finished_at).where(JobRow.state.in_(OUTCOMES))
-            bounds = (1.0, 3.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 10_800.0, 36_000.0)
-            durations = {outcome: Durations(bounds) for outcome in OUTCOMES}
-            for outcome, started, finished in session.execute(ended):
-                if started is not None and finished is not None:
-                    lasted = datetime.fromisoformat(finished) - datetime.fromisoformat(started)
-                    durations[outcome].add(max(lasted.total_seconds(), 0.0))  # clocks may be set back
+        with self._database.moment() as session:  # jobs are deleted and tallied meanwhile
+            states, finished, durations = _counts(session), count_jobs(session), read_durations(session)
         yield self.jobs.of(([state], states.get(state, 0)) for state in ACTIVE)
-        yield self.finished.of(([outcome], states.get(outcome, 0)) for outcome in OUTCOMES)
-        yield self.duration.spread(([outcome], durations[outcome]) for outcome in OUTCOMES)
+        yield self.finished.of(([outcome], count) for outcome, count in finished.items())
+        yield self.duration.spread(([outcome], each) for outcome, each in durations.items())
 
 
 def check_queue(queue: JobQueue, lasting: FaultAge) -> tuple[PartState, str]:

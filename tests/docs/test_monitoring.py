@@ -9,7 +9,7 @@ import yaml
 from docs.metrics import KINDS
 from service.contract.states import ACTIVE
 from service.learning.ingest.monitor import WINDOWS_S
-from service.training.metrics import OUTCOMES
+from service.training.ended import OUTCOMES
 from tests import ROOT
 
 FOLDER = ROOT / "deploy/monitoring"

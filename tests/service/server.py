@@ -24,7 +24,7 @@ class Server:
     """`lipserve serve` on a home; settings are environment variables.
 
     warm: fork it from a process with its imports, for shared services only; port: a free one if None; log: file for its
-    output, beside the home if None; constants: of a warm one, by module and name.
+    output, beside the home if None; constants: of a warm one, by module and name; module: that a cold one runs.
     """
 
     patience = DEADLINE
@@ -37,8 +37,10 @@ class Server:
         port: int | None = None,
         log: Path | None = None,
         constants: Mapping[str, Any] | None = None,
+        module: str = "service",
         **settings: str,
     ) -> None:
+        self.module = module
         self.home, self.log = home, home.with_name(home.name + ".log") if log is None else log
         self.port = free_port() if port is None else port
         self.url = f"http://127.0.0.1:{self.port}"
@@ -57,7 +59,7 @@ class Server:
 
     def _spawned(self, arguments: list[str], environment: dict[str, str]) -> subprocess.Popen[bytes]:
         with self.log.open("ab") as log:
-            command = [sys.executable, "-m", "service", *arguments]
+            command = [sys.executable, "-m", self.module, *arguments]
             return subprocess.Popen(command, env=environment, stdout=log, stderr=log)
 
     def _ready(self) -> bool:

@@ -27,6 +27,7 @@ from service.learning import owner
 from service.learning.ingest import consequences
 from service.learning.ingest.clock import StreamClocks
 from service.learning.ingest.monitor import Monitor
+from service.learning.streams import Streams
 from service.learning.weigher.weighing import Weighing
 from service.models import registry
 from service.models.loaded import LoadedModels, ServedModel
@@ -176,12 +177,21 @@ class ObservationLog:
         """
         self._wake(model)
         if monitor.due(RETAIN_EVERY):
-            try:
-                retain(self.database, self.settings, model, time.time())
-                with self.turn(monitor, model), self.database.transaction(model) as session:
-                    monitor.streams.expire(session, model, time.time() - self.settings.observation_retention_s)
-            except Exception as error:  # the batch is logged nevertheless
-                logger.error("could not delete old batches from the log of model %s", model, exc_info=error)
+            self.retain(model, monitor)
+
+    def retain(self, model: str, monitor: Monitor | None) -> None:
+        """Delete the observations of a model beyond the limits, and its streams that have long been silent.
+
+        monitor: of the model, None if it has none yet.
+        """
+        try:
+            retain(self.database, self.settings, model, time.time())
+            turn = self.database.turn(model) if monitor is None else self.turn(monitor, model)
+            with turn, self.database.transaction(model) as session:
+                streams = Streams.restored(session, model) if monitor is None else monitor.streams
+                streams.expire(session, model, time.time() - self.settings.observation_retention_s)
+        except Exception as error:  # batches are logged nevertheless
+            logger.error("could not delete old batches from the log of model %s", model, exc_info=error)
 
 
 def follow_rows(

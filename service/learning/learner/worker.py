@@ -36,7 +36,7 @@ def run(settings: Settings, connection: Connection) -> None:
     snapshots.sweep(database, files)
     learner = Learner(database, files, settings)
     try:
-        with suppress(EOFError, BrokenPipeError):  # the service is gone
+        with suppress(EOFError, ConnectionError):  # the service is gone
             beaten = time.monotonic()
             while (work := receive_work(connection, min(learner.pause(), BEAT_S))) is not None:
                 learner.wake({str(model) for model in work})

@@ -45,7 +45,7 @@ def run(settings: Settings, connection: Connection) -> None:
     database, files = Database.of(settings), Files.of(settings)
     weigher = Weigher(Versions(database, files))
     try:
-        with suppress(EOFError, BrokenPipeError):  # the service is gone
+        with suppress(EOFError, ConnectionError):  # the service is gone
             beaten = time.monotonic()
             while (work := receive_work(connection, min(weigher.pause(), BEAT_S))) is not None:
                 for about, given in work.items():

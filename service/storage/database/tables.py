@@ -106,6 +106,19 @@ class JobRow(Base):
     """Id of the API key that queued it, None without keys."""
 
 
+class DeletedJobsRow(Base):
+    """The deleted jobs of an outcome, so that counters of jobs never fall."""
+
+    __tablename__ = "deleted_jobs"
+
+    outcome: Mapped[str] = mapped_column(String(16), primary_key=True)
+    jobs: Mapped[int]
+    seconds: Mapped[float]
+    """Sum of their durations, s."""
+    durations: Mapped[list[int]] = mapped_column(JSON)
+    """Number of jobs by duration, see `service.training.ended`."""
+
+
 class ReplicaRow(Base):
     """A service that shares the database with others."""
 

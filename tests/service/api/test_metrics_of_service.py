@@ -6,12 +6,14 @@ from prometheus_client.parser import text_string_to_metric_families as parse
 from sqlalchemy import delete
 
 from docs import metrics as table
+from service.models import registry
 from service.storage.database import JobRow
 from service.training.metrics import JobMetrics
 from tests import ROOT
 from tests.docs.test_monitoring import EXPRESSIONS, METRIC
 from tests.service.api.test_requests import QUERY
 from tests.service.data import QUICK, queue, service_of, stream, upload
+from tests.service.learning.learning_models import QUERIES, publish
 
 DOCUMENT = ROOT / "docs/reference/metrics.md"
 FAST_OPTIONS = {**QUICK, "posterior_samples": 40}
@@ -170,3 +172,20 @@ def test_waiting_jobs_are_counted(no_worker):
     assert waiting() == before + 1
     assert no_worker.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"
     assert waiting() == before
+
+
+def test_deleted_model_leaves_no_label_and_its_requests_stay_counted(api, trained):
+    service = service_of(api)
+    folder = service.files.version_folder(registry.find(service.database, trained.name, 1).folder)
+    publish(service.database, service.files, folder, "brief")
+
+    def send_requests():
+        assert api.post("/v1/models/brief/predict", json=QUERIES).status_code == 200
+        assert any(("model", "brief") in labels for _, labels in scrape(api))
+        assert api.delete("/v1/models/brief").status_code == 204
+
+    found = increases(api, send_requests)
+    assert value(found, "lipserve_requests_total", method="POST", route=PREDICT, status="200") == 1
+    deleted = {"method": "DELETE", "route": "/v1/models/{model}", "status": "204"}
+    assert value(found, "lipserve_requests_total", **deleted) == 1
+    assert not any(("model", "brief") in labels for _, labels in scrape(api))

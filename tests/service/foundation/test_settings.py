@@ -136,6 +136,13 @@ def test_variables_of_clients_tests_and_kubernetes_are_known():
         check_environment(services)
 
 
+def test_variables_that_tests_read_are_known():
+    files = (Path(__file__).parents[2]).rglob("*.py")
+    read = {name for file in files for name in re.findall(r'environ(?:\.get\(|\[)"(LIPSERVE_\w+)"', file.read_text())}
+    assert {"LIPSERVE_HISTORY_S", "LIPSERVE_ATTACK_SEED", "LIPSERVE_YEAR_SEED"} <= read
+    assert check_environment(dict.fromkeys(read, "1")) == []
+
+
 def test_removed_variables_are_replaced_by_settings():
     names = {name.upper() for name in Settings.model_fields}
     assert names.isdisjoint(REMOVED_VARIABLES)

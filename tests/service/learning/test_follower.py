@@ -1,5 +1,6 @@
 """Followers of the log: what they learn, publish and store, and how several take turns."""
 
+import multiprocessing
 import time
 from math import inf
 
@@ -12,9 +13,11 @@ from lipcore.vocabulary import Code
 from service.journal import log
 from service.learning.learner import follower as follower_module
 from service.learning.learner import publication
+from service.learning.learner import worker as learner_worker
 from service.learning.learner.follower import Follower, Novelty
 from service.learning.learner.publication import LearningFailure, Publication
 from service.learning.learner.worker import Learner
+from service.learning.weigher import worker as weigher_worker
 from service.storage.database import SnapshotRow
 from tests.service.learning.pendulums import (
     ARM,
@@ -32,6 +35,15 @@ def arm(arm, monkeypatch):
     monkeypatch.setattr(follower_module, "SNAPSHOT_PERIODS", 1e8)
     publication.clear(arm.files)
     return arm
+
+
+@pytest.mark.parametrize("process", [learner_worker, weigher_worker])
+def test_process_ends_in_order_if_the_service_dies_with_unread_messages(arm, process):
+    ours, theirs = multiprocessing.Pipe()
+    theirs.send("unread")
+    ours.close()  # the next read of the other end is refused with ECONNRESET
+    process.run(arm.settings, theirs)
+    theirs.close()
 
 
 def start_follower(arm):

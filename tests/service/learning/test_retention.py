@@ -10,7 +10,7 @@ from service.journal import log, snapshots
 from service.journal.arrivals import is_forgotten
 from service.journal.log import Memory, encode
 from service.learning.streams import Streams
-from service.storage.database import LearnerRow, ServingRow, SnapshotRow, StreamRow, now
+from service.storage.database import EventRow, LearnerRow, ServingRow, SnapshotRow, StreamRow, now
 from tests.choosing import slow
 from tests.service.learning.batches import (
     MODEL,
@@ -23,6 +23,7 @@ from tests.service.learning.batches import (
     make_rows,
     unlearn_batch,
 )
+from tests.service.learning.learning_models import observation_batch
 
 BATCH_BYTES = len(encode(make_rows()))
 
@@ -179,3 +180,20 @@ def test_active_streams_are_not_replaced(database):
     append_limited(database, "new", 1011.0, max_streams=3)
     assert find_stream(database, "robot-0") is None
     assert find_stream(database, "robot-1") is not None
+
+
+@pytest.mark.slow
+def test_observations_and_streams_of_an_idle_model_are_deleted(learning_service, monkeypatch):
+    idle, parts = learning_service.create_model(), learning_service.service
+    idle.send_batches(0, 1, 2)
+    with parts.database.transaction() as session:
+        rows = list(session.scalars(select(EventRow).where(EventRow.model == idle.name)))
+        for row in [*rows, session.get_one(StreamRow, (idle.name, "arm"))]:
+            row.received -= 7200.0
+        session.add(SnapshotRow(id="snap_idle", model=idle.name, version=1, number=3, created_at=now()))
+    limited = parts.settings.model_copy(update={"observation_retention_s": 3600.0})
+    monkeypatch.setattr(parts.learners._log, "settings", limited)
+    parts.learners.retain()
+    assert [event.number for event in list_events(parts.database, idle.name)] == [3]  # the next number follows it
+    assert find_stream(parts.database, "arm", idle.name) is None
+    assert idle.post("observations", observation_batch(3, "new"))["state"] == "learnt"

@@ -107,7 +107,8 @@ def test_stream_reports_and_events_become_records(tmp_path):
     added = ("streams DROP COLUMN record", "learning DROP COLUMN payload", "events DROP COLUMN clock")
     added += ("models DROP COLUMN thresholds", "versions DROP COLUMN note", "versions DROP COLUMN tags")
     changes = (f"ALTER TABLE {each}" for each in added)
-    execute(tmp_path, *changes, "DROP TABLE alarm_events", "UPDATE alembic_version SET version_num = '0006'")
+    dropped = ("DROP TABLE alarm_events", "DROP TABLE deleted_jobs")
+    execute(tmp_path, *changes, *dropped, "UPDATE alembic_version SET version_num = '0006'")
     database = Database(tmp_path)
     with database.session() as session:
         known = Streams.restored(session, batches.MODEL)

@@ -34,6 +34,38 @@ def test_models_beyond_the_max_share_a_label_of_requests_and_streams():
     assert set(meters.streams()) == {"a", OTHER}
 
 
+def test_deleted_models_share_a_label_and_make_room_for_others():
+    meters = Meters(most_models=2)
+
+    def send_requests(*models):
+        for name in models:
+            meters.requests.find(Kind("GET", "/r", name, 200, ""), exists=True).add(0.1)
+
+    def requests():
+        return {kind.model: sum(each.counts) for kind, each in meters.requests.totals().items()}
+
+    def streams():
+        return {name: (sum(each.durations.counts), each.late, each.refused) for name, each in meters.streams().items()}
+
+    send_requests("kept", "gone", "beyond")
+    meters.stream("gone").durations.add(0.2)
+    meters.stream("gone").count_late()
+    meters.stream("gone").refuse("invalid_request")
+    assert requests() == {"kept": 1, "gone": 1, OTHER: 1}
+    meters.forget("gone")
+    meters.forget("unknown")
+    assert requests() == {"kept": 1, OTHER: 2}
+    assert streams() == {OTHER: (1, 1, {"invalid_request": 1})}
+    assert [meters.requests.label(name) for name in ("new", "gone")] == ["new", OTHER]
+    meters.forget("new")
+    send_requests("gone", "gone", "gone")  # created again
+    meters.stream("gone").durations.add(0.2)
+    assert requests() == {"kept": 1, OTHER: 2, "gone": 3}
+    assert streams() == {OTHER: (1, 1, {"invalid_request": 1}), "gone": (1, 0, {})}
+    meters.forget("gone")
+    assert requests() == {"kept": 1, OTHER: 5}
+
+
 @pytest.fixture
 def stream_session():
     return make_session(FakeVersions(v1=FakeModel()), 1)[0]

@@ -1,7 +1,9 @@
 /* A wall clock that a test sets: shifts CLOCK_REALTIME and related clocks by the seconds in a mapped file.
  *
- * For LD_PRELOAD; CLOCK_OFFSET_FILE is the path of the file, which contains a native double. Absolute deadlines, as in
- * Python's multiprocessing, are shifted back, because the kernel's clock is unchanged. Other clocks are not shifted.
+ * For LD_PRELOAD; CLOCK_OFFSET_FILE is the path of the file, which contains two native doubles: by how much the clock
+ * was set, and how long the machine has slept. The second also shifts CLOCK_BOOTTIME, as sleep does. Absolute deadlines,
+ * as in Python's multiprocessing, are shifted back, because the kernel's clock is unchanged. CLOCK_MONOTONIC, which does
+ * not run while a machine sleeps, and other clocks are not shifted.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -14,7 +16,7 @@
 #include <time.h>
 #include <unistd.h>
 
-static const volatile double *offset;
+static const volatile double *offset; /* {set, slept}, s */
 static int (*real_gettime)(clockid_t, struct timespec *);
 static int (*real_timedwait)(sem_t *, const struct timespec *);
 
@@ -22,7 +24,7 @@ __attribute__((constructor)) static void start(void) {
     const char *path = getenv("CLOCK_OFFSET_FILE");
     int file = path ? open(path, O_RDONLY | O_CLOEXEC) : -1;
     if (file >= 0) {
-        void *page = mmap(NULL, sizeof(double), PROT_READ, MAP_SHARED, file, 0);
+        void *page = mmap(NULL, 2 * sizeof(double), PROT_READ, MAP_SHARED, file, 0);
         if (page != MAP_FAILED) offset = page;
         close(file);
     }
@@ -42,8 +44,10 @@ static struct timespec shifted(struct timespec at, double seconds) {
 int clock_gettime(clockid_t clock, struct timespec *at) {
     if (!real_gettime) real_gettime = dlsym(RTLD_NEXT, "clock_gettime");
     int failed = real_gettime(clock, at);
-    if (!failed && offset && (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE)) *at = shifted(*at, *offset);
-    return failed;
+    if (failed || !offset) return failed;
+    if (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE) *at = shifted(*at, offset[0] + offset[1]);
+    if (clock == CLOCK_BOOTTIME) *at = shifted(*at, offset[1]);
+    return 0;
 }
 
 int gettimeofday(struct timeval *restrict at, void *restrict zone) {
@@ -65,6 +69,6 @@ time_t time(time_t *at) {
 int sem_timedwait(sem_t *restrict sem, const struct timespec *restrict deadline) {
     if (!real_timedwait) real_timedwait = dlsym(RTLD_NEXT, "sem_timedwait");
     if (!offset) return real_timedwait(sem, deadline);
-    struct timespec end = shifted(*deadline, -*offset);
+    struct timespec end = shifted(*deadline, -(offset[0] + offset[1]));
     return real_timedwait(sem, &end);
 }

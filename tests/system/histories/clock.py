@@ -1,9 +1,10 @@
-"""A wall clock for one service, which a test can set while the service runs."""
+"""A wall clock for one service, which a test can set or advance while the service runs."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
+import time
 from functools import cache
 from pathlib import Path
 from struct import pack
@@ -23,7 +24,8 @@ def _compile_library() -> Path:
 
 
 class Clock:
-    """The clock of one service, also after its restarts. file: contains the offset from the machine's clock in seconds.
+    """The clock of one service, also after its restarts. file: contains the seconds by which the clock was set, and
+    those that the machine has slept.
 
     Without a C compiler the clock cannot be set, and `movable` is false.
     """
@@ -31,13 +33,26 @@ class Clock:
     movable = COMPILER is not None
 
     def __init__(self, file: Path) -> None:
-        self.file = file
+        self.file, self.slept = file, 0.0
         self.set(0.0)
 
     def set(self, seconds: float) -> None:
-        """Set the offset in seconds, with immediate effect."""
+        """Set the offset from the right time in seconds, with immediate effect."""
+        self._offset = seconds
+        self._write()
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass as while the machine sleeps: all clocks advance but the monotonic one."""
+        self.slept += seconds
+        self._write()
+
+    def now(self) -> float:
+        """Return the right time, Unix time, s."""
+        return time.time() + self.slept
+
+    def _write(self) -> None:
         with self.file.open("r+b" if self.file.exists() else "wb") as file:  # in place, because it is mapped
-            file.write(pack("=d", seconds))
+            file.write(pack("=2d", self._offset, self.slept))
 
     @property
     def environment(self) -> dict[str, str]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-FIRST, HEAD = "0004", "0012"
+FIRST, HEAD = "0004", "0013"
 """The revision of release 0.2.0, the oldest that is upgraded, and the one that this release needs."""
 
 
