@@ -16,8 +16,9 @@ from service.learning.ingest.frames import Frames, FramesResult
 from service.learning.learners import Learners
 from service.models.served import AnsweringModels
 
-MAX_WAIT_S = 0.8
-"""Max wait of frames for the control plane, s: less than a stream of 1 kHz collects until it stops reading."""
+MAX_WAIT_S = 2.0
+"""Max wait of frames for the control plane, s: a restart takes less, and a stream of 1 kHz is read for twice as
+long."""
 MAX_FURTHER_WAIT_S = 0.02
 """The same while it has not answered since earlier frames were refused: a stream is not read less often for it."""
 RESEND_S = 0.01
