@@ -100,15 +100,18 @@ def test_workers_infer_as_threads_do(api, pool, count, outputs):
     assert (answers[0][0] == 200) == (count < 1000 or outputs[0].startswith("tau")) or count == 90
 
 
-def test_short_queries_stay(api, trained, monkeypatch):
+def test_short_queries_stay(api, trained):
     class NoWorkers:
         async def run(self, *_):
             raise AssertionError("a short query was computed elsewhere")
 
-    monkeypatch.setattr(api.app.state, "workers", NoWorkers())
-    for body in (rows(1), rows(64), rows(1, covariance=True), rows(1, components=["gravity"])):
-        assert api.post("/v1/models/pendulum/predict", json=body).status_code == 200
-    assert api.post("/v1/models/panda-sim/gravity", json={"q": [0.1] * 7}).status_code == 200
+    api.app.state.workers = NoWorkers()
+    try:
+        for body in (rows(1), rows(64), rows(1, covariance=True), rows(1, components=["gravity"])):
+            assert api.post("/v1/models/pendulum/predict", json=body).status_code == 200
+        assert api.post("/v1/models/panda-sim/gravity", json={"q": [0.1] * 7}).status_code == 200
+    finally:
+        api.app.state.workers = None
     for body, long in ((rows(64), False), (rows(65), True), (rows(2, covariance=True), True)):
         assert is_long(queries.decode(json.dumps(body).encode())) is long
     assert len(json.dumps(rows(64, 7))) < MAX_SHORT_BODY

@@ -171,6 +171,11 @@ def test_connection_on_its_way_to_a_control_plane_that_ends_is_closed(planes):
         eventually(lambda: planes.link.passed.count(None) == 0)
 
 
+def test_query_that_waits_for_a_revision_wakes_the_learner(planes):
+    planes.link.loaded.wake("arm")
+    eventually(lambda: planes.loaded.woken == ["arm"])
+
+
 def connections_in_memory():
     return sum(issubclass(type(each), (GuardedProtocol, StreamProtocol)) for each in gc.get_objects())
 
