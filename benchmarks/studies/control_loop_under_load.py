@@ -16,10 +16,12 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
+import re
 import shutil
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -117,8 +119,9 @@ def _spin() -> None:
 
 
 def measure(bed: Bed, names: list[str], rate: float, seconds: float) -> dict[str, Measured]:
-    """Return the latencies of both streams during a window."""
+    """Return the latencies of both streams during a window; print what the loads have got meanwhile."""
     paths = {"torque": f"/v1/models/{MODEL}/stream?std=1&version=1", "echo": "/v1/echo/stream"}
+    before = count_requests(bed)
     with loaded(bed, names):
         out = {what: multiprocessing.Queue() for what in paths}
         loops = [
@@ -127,7 +130,19 @@ def measure(bed: Bed, names: list[str], rate: float, seconds: float) -> dict[str
         ]
         for each in loops:
             each.start()
-        return {what: results.get(timeout=seconds + TIMEOUT) for what, results in out.items()}
+        measured = {what: results.get(timeout=seconds + TIMEOUT) for what, results in out.items()}
+    answers = count_requests(bed) - before
+    texts = (f"{number} {status}" for status, number in sorted(answers.items()))
+    print(f"  other requests by status: {', '.join(texts)}", file=sys.stderr)
+    return measured
+
+
+def count_requests(bed: Bed) -> Counter[str]:
+    """Return the number of answered requests by status."""
+    found: Counter[str] = Counter()
+    for status, number in re.findall(r'^lipserve_requests_total{.*status="(\d+)".*} (\d+)', bed.client.metrics(), re.M):
+        found[status] += int(number)
+    return found
 
 
 def report(name: str, what: str, windows: list[Measured]) -> None:
@@ -166,6 +181,7 @@ def main() -> None:
             process.start()
         for number in range(given.windows):
             for each in given.planes if number % 2 == 0 else reversed(given.planes):
+                print(f"window {number + 1} with data plane {each}", file=sys.stderr)
                 with serving(homes[each], _settings(each)) as bed:
                     results.setdefault(each, []).append(measure(bed, given.loads, given.rate, given.seconds))
     print(f"model {MODEL}, learning {ARM}, loads: {', '.join(given.loads) or 'none'}, {given.spin} busy processes")

@@ -1,8 +1,9 @@
 """Memory of a service of two planes beside one process: sums of PSS, time to be ready and to stop.
 
-    python benchmarks/studies/planes_memory.py HOME [MODEL]
+    python benchmarks/studies/planes_memory.py HOME [MODEL JOINTS]
 
-HOME is copied. PSS counts a shared page in equal parts, so that a sum over processes counts it once.
+HOME is copied; the model is panda-sim by default. PSS counts a shared page in equal parts, so that a sum over
+processes counts it once.
 """
 
 from __future__ import annotations
@@ -26,29 +27,32 @@ QUERIES = 300
 
 def main() -> None:
     """Print a line for each kind of service."""
-    home, model = Path(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else "panda-sim"
+    home, model, joints = Path(sys.argv[1]), *(sys.argv[2:] or ("panda-sim", "7"))
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "home"
         shutil.copytree(home, copy)
         for planes in ("off", "on"):
-            print(measure(copy, planes, model))
+            print(measure(copy, planes, model, int(joints)))
 
 
-def measure(home: Path, planes: str, model: str) -> str:
+def measure(home: Path, planes: str, model: str, joints: int) -> str:
     """Start, query and stop a service; return its figures."""
     environment = {**os.environ, "LIPSERVE_HOME": str(home), "LIPSERVE_DATA_PLANE": planes}
     command = [sys.executable, "-m", "service", "serve", "--port", str(PORT)]
     began = time.monotonic()
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as process:  # noqa: S603
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)  # noqa: S603
+    try:
         wait_until_ready(began)
         ready_s, cpu_s = time.monotonic() - began, sum(map(cpu_seconds, tree(process.pid)))
         time.sleep(3.0)  # the weigher starts after the service is ready
         fresh = pss_mb(process.pid)
-        use(model)
+        use(model, joints)
         used = pss_mb(process.pid)
         began = time.monotonic()
         process.terminate()
         process.wait(WAIT_S)
+    finally:
+        process.kill()
     return (
         f"data plane {planes}: ready after {ready_s:.1f} s ({cpu_s:.1f} s of CPU), "
         f"memory {fresh:.0f} MB fresh, {used:.0f} MB after requests, stopped after {time.monotonic() - began:.1f} s"
@@ -66,10 +70,9 @@ def wait_until_ready(began: float) -> None:
     raise TimeoutError("the service is not ready")
 
 
-def use(model: str) -> None:
+def use(model: str, joints: int) -> None:
     """Send queries and pages, as a robot and a dashboard do."""
     with httpx.Client(base_url=URL, timeout=WAIT_S) as client:
-        joints = len(client.get(f"/v1/models/{model}").json()["joint_names"])
         query = {each: [0.1] * joints for each in ("q", "dq", "ddq")}
         for _ in range(QUERIES):
             client.post(f"/v1/models/{model}/predict", json=query).raise_for_status()

@@ -27,7 +27,7 @@ MODEL, ARM, DATA = "panda-sim", "arm", "recording"
 """The model of the control loop; the model that is trained and learns; its data set."""
 MiB = 1024 * 1024
 LARGE_ROWS, ROWS, BATCH = 1_000_000, 1000, 1000
-QUICK = {"hyperparameter_samples": 50, "posterior_samples": 100, "max_iterations": 5}
+QUICK = {"hyperparameter_samples": 30, "posterior_samples": 60, "max_iterations": 4}
 JSON, CSV = {"content-type": "application/json"}, {"content-type": "text/csv"}
 TIMEOUT_S = 60.0
 FAILURES = (OSError, http.client.HTTPException, lipserve.ApiError, lipserve.ServiceUnreachableError)

@@ -103,13 +103,24 @@ class DataProtocol(GuardedProtocol):
     def handle_websocket_upgrade(self) -> None:
         """Begin a stream, whose request may still be handed over."""
         self.app_state = {**self.app_state, _REQUEST: (self._query, self.peer)}
+        self._forget_scope()
         super().handle_websocket_upgrade()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Remove the connection."""
+        super().connection_lost(exc)
+        self._forget_scope()
 
     def on_message_begin(self) -> None:
         """Give the application a way to hand the request over."""
         super().on_message_begin()
         scope: Any = self.scope
         scope[CONNECTION] = self
+
+    def _forget_scope(self) -> None:
+        """End the reference cycle between connection and request, see `StreamProtocol`."""
+        if self.scope is not None:
+            self.scope.pop(CONNECTION, None)  # type: ignore[misc]
 
     def on_message_complete(self) -> None:
         """Note that the parser has read the whole request."""

@@ -141,6 +141,7 @@ class GuardedProtocol(HttpToolsProtocol):
         self._upgraded = True
         self._cancel_head()
         super().handle_websocket_upgrade()
+        self.parser: Any = None  # no reference cycle, as in uvicorn's `connection_lost`
 
     def send_400_response(self, msg: str) -> None:
         """Answer bytes that are not HTTP."""

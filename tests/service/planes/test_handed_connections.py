@@ -1,13 +1,16 @@
 """What a connection keeps when it passes between the planes: its client, its limits, its unsent answers."""
 
+import gc
 import json
 import os
 import socket
 from contextlib import suppress
 
 import pytest
+from websockets.sync.client import connect
 
 from service.api.limits.requests import COUNTED, ClientPatience
+from service.api.server.connections import GuardedProtocol, StreamProtocol
 from tests.service.api.limits.serving import RawConnection, Serving
 from tests.service.data import DEADLINE, eventually
 from tests.service.planes.requests import ECHO, HOST, PAGE, Digest, echo
@@ -166,3 +169,30 @@ def test_connection_on_its_way_to_a_control_plane_that_ends_is_closed(planes):
         with suppress(ConnectionResetError):
             assert client.socket.recv(1) == b""
         eventually(lambda: planes.link.passed.count(None) == 0)
+
+
+def test_query_that_waits_for_a_revision_wakes_the_learner(planes):
+    planes.link.loaded.wake("arm")
+    eventually(lambda: planes.loaded.woken == ["arm"])
+
+
+def connections_in_memory():
+    return sum(issubclass(type(each), (GuardedProtocol, StreamProtocol)) for each in gc.get_objects())
+
+
+@pytest.mark.parametrize("kind", [Serving, TwoPlanes])
+def test_closed_connections_need_no_garbage_collection(kind):
+    with kind() as serving:
+        gc.collect()
+        before = connections_in_memory()
+        gc.disable()
+        try:
+            for request in (echo(b"abc"), PAGE, echo(b"later")):
+                with serving.connect() as client:
+                    assert [client.ask(request)[0] for _ in range(2)] == [200, 200]
+            with connect(f"ws://127.0.0.1:{serving.port}/v1/echo/stream") as stream:
+                stream.send(b"abc")
+                assert stream.recv(DEADLINE) == b"abc"
+            eventually(lambda: connections_in_memory() == before, 10)
+        finally:
+            gc.enable()
