@@ -128,6 +128,7 @@ def create_app(settings: Settings | None = None, shared: Shared | None = None) -
         telemetry=requests.telemetry(settings),
     )
     app.state.stopping, app.state.meters, app.state.confined = stopping, meters, protections()
+    app.state.workers = None
     errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot, shared)
     openapi.install(app, settings.keys_needed)

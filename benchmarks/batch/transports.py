@@ -166,6 +166,14 @@ def _time(ask: Ask, batch: Array, service: int | None) -> tuple[float, float]:
 
 
 def _cpu_s(service: int | None) -> float:
-    """Return the CPU time of this process, and of a service if it is given, s."""
+    """Return the CPU time of this process, and of all processes of a service if it is given, s."""
     # the identifier that Linux's clock_getcpuclockid returns
-    return time.process_time() + (0.0 if service is None else time.clock_gettime((~service << 3) | 2))
+    return time.process_time() + sum(time.clock_gettime((~pid << 3) | 2) for pid in _processes(service))
+
+
+def _processes(service: int | None) -> list[int]:
+    """Return the ids of the processes of a service."""
+    if service is None:
+        return []
+    children = Path(f"/proc/{service}/task").glob("*/children")
+    return [service, *(each for pids in children for pid in pids.read_text().split() for each in _processes(int(pid)))]

@@ -14,25 +14,25 @@ from service.foundation.fields import finite
 from service.inference import texts
 from service.inference.evaluating import judge, read_dataset
 from service.models.loaded import LoadedModels, ServedModel
+from service.storage.storage import Storage
 
 FIGURES = ("nmse", "rmse", "coverage", "nlpd", "interval_width", "verdict")
 """Fields of an evaluation that a comparison has of each version."""
 
 
-def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> schema.CompareResponse:
-    """Compare two versions on a data set. Blocking: use it in a thread.
-
-    Raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
-    """
-    first, second = versions = _versions(loaded, model, request)
-    recorded = read_dataset(loaded, request.dataset, *versions)
+def compare(
+    storage: Storage, versions: tuple[ServedModel, ServedModel], request: schema.CompareRequest
+) -> schema.CompareResponse:
+    """Compare two versions of a model on a data set; raise InvalidRequestError, NotFoundError or DamagedDataError."""
+    first, second = versions
+    recorded = read_dataset(storage, request.dataset, *versions)
     answers = [each.model.predict_along(recorded.used).interval for each in versions]
     compared = metrics.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
     in_training = [each.has_learnt_from(recorded.id, recorded.sha256) for each in versions]
-    judged = [judge(loaded, recorded, *each) for each in zip(versions, answers, in_training, strict=True)]
+    judged = [judge(storage, recorded, *each) for each in zip(versions, answers, in_training, strict=True)]
     return schema.CompareResponse(
-        model=model,
+        model=first.name,
         dataset=recorded.id,
         joint_names=list(first.model.joint_names),
         samples=recorded.samples,
@@ -62,7 +62,11 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
     )
 
 
-def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> tuple[ServedModel, ServedModel]:
+def find_versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> tuple[ServedModel, ServedModel]:
+    """Return the two versions of a comparison. Blocking: use it in a thread.
+
+    Raise InvalidRequestError if they are the same, NotFoundError or UnreadableVersionError.
+    """
     first, second = (
         loaded.get(model, named, None) if isinstance(named, int) else loaded.get(model, None, named)
         for named in request.versions

@@ -26,9 +26,10 @@ from service.inference import texts
 from service.inference.predicting import MAX_COMPONENT_BATCH, check_offered
 from service.models import registry, verdicts
 from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
-from service.models.loaded import LoadedModels, ServedModel
+from service.models.served import ServedModel
 from service.storage import sample_file
 from service.storage.database import DatasetRow
+from service.storage.storage import Storage
 from service.training import holding_out, repeating
 from service.training.holding_out import CannotHoldOutError, SetSplit
 
@@ -48,31 +49,31 @@ class EvaluationData:
     """The evaluated samples, thinned evenly."""
 
 
-def read_dataset(loaded: LoadedModels, dataset: str, *versions: ServedModel) -> EvaluationData:
+def read_dataset(storage: Storage, dataset: str, *versions: ServedModel) -> EvaluationData:
     """Return the samples of a data set for these versions.
 
     Raise NotFoundError, or InvalidRequestError if the joints differ.
     """
-    row = find_dataset(loaded, dataset, *versions)
-    used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES, joint_types=versions[0].model.joint_types)
+    row = find_dataset(storage, dataset, *versions)
+    used = store.samples(storage.files, row, MAX_EVALUATION_SAMPLES, joint_types=versions[0].model.joint_types)
     return EvaluationData(row.id, row.sha256, row.rows, used)
 
 
-def read_held_out(loaded: LoadedModels, dataset: str, served: ServedModel) -> EvaluationData:
+def read_held_out(storage: Storage, dataset: str, served: ServedModel) -> EvaluationData:
     """Return the samples of a data set that a version's training held out.
 
     Raise as `read_dataset` does, and InvalidRequestError if nothing was held out.
     """
-    row = find_dataset(loaded, dataset, served)
+    row = find_dataset(storage, dataset, served)
     with _splitting():
-        split = _split_of(loaded, row, served)
-        used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES, split.held_out, served.model.joint_types)
+        split = _split_of(storage, row, served)
+        used = store.samples(storage.files, row, MAX_EVALUATION_SAMPLES, split.held_out, served.model.joint_types)
     return EvaluationData(row.id, row.sha256, split.rows, used)
 
 
-def _split_of(loaded: LoadedModels, row: DatasetRow, served: ServedModel) -> SetSplit:
+def _split_of(storage: Storage, row: DatasetRow, served: ServedModel) -> SetSplit:
     """Return how a version split a data set; raise CannotHoldOutError if nothing of it was held out."""
-    split = holding_out.find_earlier_split(row, _manifest(loaded, served)["lineage"])
+    split = holding_out.find_earlier_split(row, _manifest(storage, served)["lineage"])
     if split is None:
         raise CannotHoldOutError(f"version {served.version} has no held-out rows of data set {row.id}")
     return split
@@ -87,12 +88,12 @@ def _splitting() -> Iterator[None]:
         raise invalid_request("part", "held_out", f"all: {error}") from None
 
 
-def find_dataset(loaded: LoadedModels, dataset: str, *versions: ServedModel) -> DatasetRow:
+def find_dataset(storage: Storage, dataset: str, *versions: ServedModel) -> DatasetRow:
     """Return the row of a data set.
 
     Raise NotFoundError, or InvalidRequestError if its joints or torque convention differ from those of these versions.
     """
-    row = store.find(loaded.database, dataset)
+    row = store.find(storage.database, dataset)
     for served in versions:
         known = served.model
         if tuple(row.joint_names) != known.joint_names:
@@ -116,21 +117,17 @@ def _how_to_upload(row: DatasetRow, joint_names: Sequence[str]) -> str:
     return f" If they are the same joints, upload the recording with {option}."
 
 
-def evaluate(
-    loaded: LoadedModels, model: str, request: schema.EvaluateRequest, served: ServedModel | None = None
-) -> schema.EvaluateResponse:
+def evaluate(storage: Storage, served: ServedModel, request: schema.EvaluateRequest) -> schema.EvaluateResponse:
     """Evaluate a version on a data set or its held-out part; raise InvalidRequestError or NotFoundError.
 
-    If the version has since learnt the held-out rows, return the figures of its judged fit. `served` is the version if
-    the caller has found it.
+    If the version has since learnt the held-out rows, return the figures of its judged fit.
     """
-    served = served or loaded.get(model, request.version, request.alias)
-    row = find_dataset(loaded, request.dataset, served)
-    judged = _judged(loaded, row, served) if request.part == "held_out" else None
+    row = find_dataset(storage, request.dataset, served)
+    judged = _judged(storage, row, served) if request.part == "held_out" else None
     in_training, revision = False, 0
     if judged is None:
-        in_training, revision = _in_training(loaded, row, request.part, served), served.revision
-    fields = _compared(loaded, request, served, in_training) if judged is None else judged.model_dump()
+        in_training, revision = _in_training(storage, row, request.part, served), served.revision
+    fields = _compared(storage, request, served, in_training) if judged is None else judged.model_dump()
     origin: JudgedOn = "training" if in_training else "held_out" if request.part == "held_out" else "recording"
     return schema.EvaluateResponse(
         model=served.name,
@@ -141,72 +138,72 @@ def evaluate(
         joint_names=list(served.model.joint_names),
         in_training=in_training,
         judged=judged is not None,
-        verdict=_verdict(loaded, served, fields, origin, row),
+        verdict=_verdict(storage, served, fields, origin, row),
         **fields,
     )
 
 
 def judge(
-    loaded: LoadedModels, recorded: EvaluationData, served: ServedModel, answer: TorqueDistribution, in_training: bool
+    storage: Storage, recorded: EvaluationData, served: ServedModel, answer: TorqueDistribution, in_training: bool
 ) -> dict[str, Any]:
     """Return the fields of an `Evaluation` of a version's answer at the samples of a data set, and its `verdict`."""
     used = recorded.used
     figures = evaluation(used, answer, served.model.training_range)
-    figures |= _repeats(loaded, served, used, in_training)
-    row = store.find(loaded.database, recorded.id)
-    return {**figures, "verdict": _verdict(loaded, served, figures, "training" if in_training else "recording", row)}
+    figures |= _repeats(storage, served, used, in_training)
+    row = store.find(storage.database, recorded.id)
+    return {**figures, "verdict": _verdict(storage, served, figures, "training" if in_training else "recording", row)}
 
 
 def _verdict(
-    loaded: LoadedModels, served: ServedModel, figures: dict[str, Any], origin: JudgedOn, row: DatasetRow
+    storage: Storage, served: ServedModel, figures: dict[str, Any], origin: JudgedOn, row: DatasetRow
 ) -> Verdict:
-    options = registry.verdict_options(loaded.database, [served.name])[served.name]
-    return verdicts.of_evaluation(figures, _manifest(loaded, served), origin, row, options)
+    options = registry.verdict_options(storage.database, [served.name])[served.name]
+    return verdicts.of_evaluation(figures, _manifest(storage, served), origin, row, options)
 
 
 def _compared(
-    loaded: LoadedModels, request: schema.EvaluateRequest, served: ServedModel, in_training: bool
+    storage: Storage, request: schema.EvaluateRequest, served: ServedModel, in_training: bool
 ) -> dict[str, Any]:
     """Return the fields of an `Evaluation` of a version."""
-    recorded = (read_dataset if request.part == "all" else read_held_out)(loaded, request.dataset, served)
+    recorded = (read_dataset if request.part == "all" else read_held_out)(storage, request.dataset, served)
     used = recorded.used
     answer = served.model.predict_along(used)
-    repeats = _repeats(loaded, served, used, in_training)
+    repeats = _repeats(storage, served, used, in_training)
     figures = evaluation(used, answer.interval, served.model.training_range)
     return {"samples": recorded.samples, **figures, **repeats}
 
 
-def _judged(loaded: LoadedModels, row: DatasetRow, served: ServedModel) -> Evaluation | None:
+def _judged(storage: Storage, row: DatasetRow, served: ServedModel) -> Evaluation | None:
     """Return the judged fit's evaluation of a data set's held-out part; None unless the lineage contains it."""
-    if not (record := _holdout_of(loaded, served)).get("learnt"):
+    if not (record := _holdout_of(storage, served)).get("learnt"):
         return None
     holdout = HoldoutLineage.model_validate(record)
     names = [each.id for each in holdout.datasets if row.id == each.id or row.sha256 == each.sha256]
     return next((holdout.evaluations[name] for name in names if name in holdout.evaluations), None)
 
 
-def _in_training(loaded: LoadedModels, row: DatasetRow, part: schema.Part, served: ServedModel) -> bool:
+def _in_training(storage: Storage, row: DatasetRow, part: schema.Part, served: ServedModel) -> bool:
     """Return whether a version has learnt a data set, part of it, or its held-out part."""
-    if part == "held_out" and not _holdout_of(loaded, served).get("learnt"):
+    if part == "held_out" and not _holdout_of(storage, served).get("learnt"):
         return False
     return served.has_learnt_from(row.id, row.sha256)
 
 
-def _holdout_of(loaded: LoadedModels, served: ServedModel) -> dict[str, Any]:
+def _holdout_of(storage: Storage, served: ServedModel) -> dict[str, Any]:
     """Return the held-out record of a version's lineage; empty if nothing was held out."""
-    return _manifest(loaded, served)["lineage"].get("holdout") or {}
+    return _manifest(storage, served)["lineage"].get("holdout") or {}
 
 
-def _manifest(loaded: LoadedModels, served: ServedModel) -> dict[str, Any]:
-    return registry.find(loaded.database, served.name, served.version).manifest
+def _manifest(storage: Storage, served: ServedModel) -> dict[str, Any]:
+    return registry.find(storage.database, served.name, served.version).manifest
 
 
-def _repeats(loaded: LoadedModels, served: ServedModel, used: Samples, in_training: bool) -> dict[str, Any]:
+def _repeats(storage: Storage, served: ServedModel, used: Samples, in_training: bool) -> dict[str, Any]:
     """Return how much of the samples repeats the training motion, unless the version was trained on them."""
     if in_training:
         return repeating.find_repetition([], used, served.model.joint_types)
     try:
-        training = repeating.read_training_parts(loaded.database, loaded.files, _manifest(loaded, served)["lineage"])
+        training = repeating.read_training_parts(storage.database, storage.files, _manifest(storage, served)["lineage"])
         return repeating.find_repetition(training, used, served.model.joint_types)
     except (CannotHoldOutError, DamagedDataError) as error:  # the figures are valid without the training data
         return {**repeating.find_repetition([], used, ()), "warnings": [texts.describe_unknown_repetition(error)]}
@@ -215,23 +212,19 @@ def _repeats(loaded: LoadedModels, served: ServedModel, used: Samples, in_traini
 Rows = NDArray[np.int64]
 
 
-def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> schema.TraceResponse:
-    """Predict along a data set or its held-out part. Blocking: use it in a thread.
-
-    Raise InvalidRequestError, NotFoundError or DamagedDataError.
-    """
+def trace(storage: Storage, served: ServedModel, request: schema.TraceRequest) -> schema.TraceResponse:
+    """Predict along a data set or its held-out part; raise InvalidRequestError, NotFoundError or DamagedDataError."""
     if request.points > MAX_TRACE_POINTS:
         raise invalid_request("points", request.points, f"at most {MAX_TRACE_POINTS}")
-    served = loaded.get(model, request.version, request.alias)
     offered = offered_components(served.model.estimator.name)
     check_offered(served.model, request.components)
-    dataset = find_dataset(loaded, request.dataset, served)
-    path = loaded.files.samples_file(dataset.id, dataset.sha256)
+    dataset = find_dataset(storage, request.dataset, served)
+    path = storage.files.samples_file(dataset.id, dataset.sha256)
     episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
     part = np.arange(len(t), dtype=np.int64)
     if request.part == "held_out":
         with _splitting():
-            part = np.flatnonzero(_split_of(loaded, dataset, served).held_out(episode, t)).astype(np.int64)
+            part = np.flatnonzero(_split_of(storage, dataset, served).held_out(episode, t)).astype(np.int64)
     chosen = _within(part, request, len(t))
     rows = chosen[spaced_rows(len(chosen), request.points)]
     samples = Samples(served.model.joint_names, **sample_file.read(path, rows))
@@ -259,7 +252,7 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
         scale=predicted.scale.tolist(),
         offered=[name for name in get_args(schema.TraceComponent) if name in offered],
         components=_components(served, samples, request.components, MAX_COMPONENT_BATCH),
-        in_training=_in_training(loaded, dataset, request.part, served),
+        in_training=_in_training(storage, dataset, request.part, served),
     )
 
 

@@ -11,7 +11,8 @@ from lipcore.model.equation import UnavailableComponentError
 from service.contract.wrench import GravityRequest, GravityResponse
 from service.foundation.errors import invalid_request
 from service.inference.predicting import Query, check_answer, check_count, check_shapes, model_with_payload
-from service.models.loaded import LoadedModels, ServedModel
+from service.models.served import ServedModel
+from service.storage.storage import Storage
 
 
 @contextmanager
@@ -23,21 +24,17 @@ def explain_unavailable(model: str) -> Iterator[None]:
         raise invalid_request("model", model, error.expected, str(error)) from error
 
 
-def gravity(
-    loaded: LoadedModels, model: str, request: GravityRequest, served: ServedModel | None = None
-) -> GravityResponse:
-    """Return the gravity torque at N positions. Blocking: use it in a thread.
+def gravity(storage: Storage, served: ServedModel, request: GravityRequest) -> GravityResponse:
+    """Return the gravity torque at N positions.
 
     Raise InvalidRequestError, also if the model has no gravity, or NotFoundError.
-    `served` is the version if the caller has found it.
     """
-    served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     (q,) = check_shapes(request, known)
     q = np.atleast_2d(q)
     check_count("q", f"{len(q)} queries", len(q), components=True)
-    Query(q[None], request.q.ndim == 1).check(known.position_limits(loaded.storage.settings.max_position))
-    with explain_unavailable(model):
+    Query(q[None], request.q.ndim == 1).check(known.position_limits(storage.settings.max_position))
+    with explain_unavailable(served.name):
         found = model_with_payload(served, request.payload).gravity(request.q)
     check_answer("mean", found.mean)
     return GravityResponse(

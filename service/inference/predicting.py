@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import MsgspecError, Struct
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
@@ -21,13 +21,19 @@ from service.contract.decoding import HotDecoder, struct_of
 from service.contract.payload import Payload
 from service.contract.predictions import History, PredictRequest, PredictResponse
 from service.foundation.errors import invalid_request
-from service.models.loaded import LoadedModels, ServedModel
+from service.models.served import ServedModel
+from service.storage.storage import Storage
 
 Array = NDArray[np.float64]
+Buffer = bytes | memoryview
 MAX_BATCH, MAX_COMPONENT_BATCH = 1000, 100
 """Maximum queries of one prediction request, and of one with components."""
 MAX_BINARY_BATCH = 100_000
 """Maximum queries of an inference request whose tensors are binary. The size of its body limits it, too."""
+MAX_SHORT_BATCH = 64
+"""Maximum queries of a request that is answered at once. With covariance or components it has one."""
+MAX_SHORT_BODY = 32 * 1024
+"""Maximum bytes of a JSON body that is decoded at once: `MAX_SHORT_BATCH` queries of seven joints."""
 MAX_HISTORY = 1000
 """Maximum rows of the motion before a query."""
 QUANTITIES = ("q", "dq", "ddq", "tau")
@@ -238,6 +244,31 @@ _Response: Callable[..., Struct] = struct_of(PredictResponse)
 _encoder = msgspec.json.Encoder()
 
 
+class VersionOfBody(Struct):
+    """The fields of a query that choose the version, decoded without its numbers."""
+
+    version: int | None = None
+    alias: str | None = None
+    min_revision: int | None = None
+
+
+_versions = msgspec.json.Decoder(VersionOfBody)
+
+
+def version_of(body: bytes) -> VersionOfBody | None:
+    """Return the version that a JSON body chooses, None if the body is invalid. It does not check other fields."""
+    try:
+        return _versions.decode(body)
+    except (MsgspecError, RecursionError, ValueError):
+        return None
+
+
+def is_long(query: Any) -> bool:
+    """Return whether a decoded query takes so long that it must not be answered beside control loops."""
+    rows = len(query.q) if query.q and isinstance(query.q[0], list) else 1
+    return rows > (1 if query.covariance or query.components else MAX_SHORT_BATCH)
+
+
 def one_motion(query: Any) -> Array | None:
     """Return the motion (3, n) of a decoded query; None if it requests more than the torque of one motion."""
     batch = bool(query.q) and isinstance(query.q[0], list)
@@ -276,13 +307,15 @@ def predict_now(
     return _answer(served, tau, tau_std, None if answer.fallback is None else answer.fallback.share.tolist())
 
 
-def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: ServedModel | None = None) -> Struct:
-    """Return a PredictResponse to the queries. Blocking: use it in a thread.
+def predict_body(storage: Storage, served: ServedModel, body: Buffer) -> bytes | None:
+    """Return the encoded PredictResponse to a JSON body, None if the body may be invalid; raise InvalidRequestError."""
+    query = queries.decode(bytes(body))
+    request = None if query is None else queries.request(query)
+    return None if request is None else predict(storage, served, request)
 
-    Raise InvalidRequestError or NotFoundError.
-    `served` is the version if the caller has found it.
-    """
-    served = served or loaded.get(model, request.version, request.alias)
+
+def predict(storage: Storage, served: ServedModel, request: PredictRequest) -> bytes:
+    """Return the encoded PredictResponse to the queries; raise InvalidRequestError."""
     known = served.model
     single = request.q.ndim == 1
     check_offered(known, request.components)
@@ -291,7 +324,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
     count = query.values.shape[1]
     check_count("q", f"{count} queries", count, bool(request.components))
-    limits = served.model.position_limits(loaded.storage.settings.max_position)
+    limits = served.model.position_limits(storage.settings.max_position)
     query.check(limits)
     known = model_with_payload(served, request.payload)
     deflections = known_deflections(request, query, known, limits)
@@ -315,7 +348,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
             name: {part: getattr(estimates[name], part)[of_query].tolist() for part in ("mean", "std")}
             for name in request.components
         }
-    return _answer(served, **lists)
+    return encode(_answer(served, **lists))
 
 
 def _answer(

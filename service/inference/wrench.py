@@ -10,7 +10,8 @@ from lipcore.model.wrench import NoWrenchError, Wrench, external_wrench, has_wre
 from service.contract.wrench import WrenchRequest, WrenchResponse
 from service.foundation.errors import invalid_request
 from service.inference.predicting import Query, check_answer, check_count, check_shapes, model_with_payload
-from service.models.loaded import LoadedModels, ServedModel
+from service.models.served import ServedModel
+from service.storage.storage import Storage
 
 Array = NDArray[np.float64]
 PARTS = ("link", "link_covariance", "base", "base_covariance")
@@ -18,28 +19,24 @@ POSE_TOLERANCE = 1e-6
 """Max deviation of a rotation matrix from an orthonormal one."""
 
 
-def wrench(
-    loaded: LoadedModels, model: str, request: WrenchRequest, served: ServedModel | None = None
-) -> WrenchResponse:
-    """Return the external wrench at N motions. Blocking: use it in a thread.
+def wrench(storage: Storage, served: ServedModel, request: WrenchRequest) -> WrenchResponse:
+    """Return the external wrench at N motions.
 
     Raise InvalidRequestError, also if the model has no wrench or a posture is singular, or NotFoundError.
-    `served` is the version if the caller has found it.
     """
-    served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     if not has_wrench(known):
         message = (
-            f"`{model}` has no wrench: train it with a URDF, the option geometry `fixed` or `calibrate`, and one arm "
-            "of at least 6 joints."
+            f"`{served.name}` has no wrench: train it with a URDF, the option geometry `fixed` or `calibrate`, and one "
+            "arm of at least 6 joints."
         )
         expected = "a model of one arm with the geometry of a URDF and at least 6 joints"
-        raise invalid_request("model", model, expected, message)
+        raise invalid_request("model", served.name, expected, message)
     parts = check_shapes(request, known)
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), request.q.ndim == 1)
     count = query.values.shape[1]
     check_count("q", f"{count} queries", count, components=True)
-    query.check(known.position_limits(loaded.storage.settings.max_position))
+    query.check(known.position_limits(storage.settings.max_position))
     tool = None if request.tool is None else _check_pose(request.tool)
     motions = query.values[:3].swapaxes(0, 1)
     found = wrenches(model_with_payload(served, request.payload), query, motions, served.scales.of(None), tool)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import re
+from dataclasses import replace
 from typing import Any, ClassVar
 
 from service.api.limits.requests import COUNTED, HEALTH
 from service.api.requests import HANDED_OVER
 from service.api.server.connection_limit import Excess
-from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.api.server.connections import GuardedProtocol
+from service.api.server.streams import StreamProtocol
 from service.planes.counting import PassedConnections
 from service.planes.handover import OTHER, PART, Handed, PassOn, find_query, refuse_connection, shared
 
@@ -16,7 +19,8 @@ CONNECTION = "lipserve.http_connection"
 """Key of the connection in the ASGI scope of a request that the data plane may hand over."""
 _REQUEST = "lipserve.stream_request"
 """Key of the bytes of a stream's request, and its client as in `LimitedConnection`, in the state of its connection."""
-_HEALTH_REQUESTS = (f"GET {HEALTH}".encode(), f"HEAD {HEALTH}".encode())
+_HEALTH_REQUEST = re.compile(rb"[A-Z]+ " + HEALTH.encode())
+"""The start of a request that is answered on connections beyond the limit, too."""
 
 
 class DataProtocol(GuardedProtocol):
@@ -61,7 +65,8 @@ class DataProtocol(GuardedProtocol):
         if self._handed is not None:
             if self._handed.refused:
                 self.refuse_requests(self._handed.refused)
-            self._read(self._handed.read)
+            data, self._handed = self._handed.read, None  # frees memory
+            self._read(data)
 
     def data_received(self, data: bytes) -> None:
         """Handle bytes from the socket; those that come during an answer wait."""
@@ -83,7 +88,7 @@ class DataProtocol(GuardedProtocol):
             self._part = data
             self._unset_keepalive_if_required()
             self._watch_head()
-        elif size == OTHER and self.refused and not data.startswith(_HEALTH_REQUESTS):
+        elif size == OTHER and self.refused and not _HEALTH_REQUEST.match(data):
             super().data_received(data)
         elif size == OTHER:
             self._query = data
@@ -99,13 +104,24 @@ class DataProtocol(GuardedProtocol):
     def handle_websocket_upgrade(self) -> None:
         """Begin a stream, whose request may still be handed over."""
         self.app_state = {**self.app_state, _REQUEST: (self._query, self.peer)}
+        self._forget_scope()
         super().handle_websocket_upgrade()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Remove the connection."""
+        super().connection_lost(exc)
+        self._forget_scope()
 
     def on_message_begin(self) -> None:
         """Give the application a way to hand the request over."""
         super().on_message_begin()
         scope: Any = self.scope
         scope[CONNECTION] = self
+
+    def _forget_scope(self) -> None:
+        """End the reference cycle between connection and request, see `StreamProtocol`."""
+        if self.scope is not None:
+            self.scope.pop(CONNECTION, None)  # type: ignore[misc]
 
     def on_message_complete(self) -> None:
         """Note that the parser has read the whole request."""
@@ -206,7 +222,8 @@ class ControlProtocol(GuardedProtocol):
         super().connection_made(transport)
         if self._handed.refused:
             self.refuse_requests(self._handed.refused)
-        super().data_received(self._handed.read)
+        data, self._handed = self._handed.read, replace(self._handed, data=b"")  # frees memory
+        super().data_received(data)
 
     def data_received(self, data: bytes) -> None:
         """Handle bytes from the socket; pass the connection back at the start of a query."""

@@ -22,6 +22,7 @@ from service.planes.confirmations import confirm_answers
 from service.planes.dataplanes import DataPlanes
 from service.planes.inheritance import CONTROL_PART, Inheritance
 from service.planes.pulse import BEAT_S, Plane, Pulse
+from service.planes.workers.pool import WorkerPool
 from service.runtime import nursery
 from service.runtime.allocator import limit_free_memory
 
@@ -29,10 +30,11 @@ from service.runtime.allocator import limit_free_memory
 def run(inherited: Inheritance) -> None:
     """Serve all routes to the data planes that connect, until SIGTERM."""
     inherited.close_listeners()
-    nursery.start()
+    forks = nursery.start()
     multiprocessing.current_process().name = "MainProcess"  # the log does not mention it
     limit_free_memory()
     app = create_app(inherited.settings, inherited.memory.join(CONTROL_PART))
+    app.state.workers = WorkerPool(inherited.settings, forks.start)
     confirm_answers(app)
     ControlServer(app, inherited.settings, inherited.accepting, inherited.pulse).run()
 

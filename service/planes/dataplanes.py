@@ -18,7 +18,7 @@ from service.planes.connections import ControlProtocol
 from service.planes.counting import AdoptedConnections, ShedConnection
 from service.planes.frames import FramesLogged, FramesToLog, log_frames
 from service.planes.handover import Handed, adopt, pass_on
-from service.planes.publications import Answering, Confirmed, Holdings, LoadRequest, VersionUse
+from service.planes.publications import Answering, Confirmed, Holdings, LearnerWake, LoadRequest, VersionUse
 from service.planes.publisher import Publisher
 
 logger = logging.getLogger(__name__)
@@ -88,8 +88,8 @@ class DataPlanes:
                 self._publisher.subscribe(channel, message)
             case Answering() | Confirmed() | LoadRequest() | VersionUse():
                 self._publisher.receive(channel, message)
-            case ("meters", given):
-                self._app.state.data_meters = given
+            case LearnerWake(model):
+                learners.loaded.wake(model)
 
     async def _adopt(self, channel: Channel, handed: Handed, fd: int) -> None:
         self._answering = channel

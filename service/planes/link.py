@@ -64,6 +64,11 @@ class ControlLink:
         assert self._loop is not None
         self._loop.call_later(REPORT_S, self._report)
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a control plane."""
+        return self._channel is not None
+
     def close(self) -> None:
         """Close the channel for good."""
         self._closed = True

@@ -130,6 +130,13 @@ class NotLoaded:
 
 
 @dataclass(frozen=True)
+class LearnerWake:
+    """Asks the control plane to look for batches of a model that another service has logged."""
+
+    model: str
+
+
+@dataclass(frozen=True)
 class VersionUse:
     """The versions that the data plane has used since its last report, and those that only its streams keep."""
 

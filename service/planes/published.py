@@ -22,6 +22,7 @@ from service.planes.publications import (
     Answering,
     Confirmed,
     Holdings,
+    LearnerWake,
     LoadRequest,
     NewPayload,
     NewRevision,
@@ -96,7 +97,8 @@ class PublishedModels:
         return served
 
     def wake(self, model: str) -> None:
-        """Do nothing: the control plane wakes the learner."""
+        """Let the control plane wake the learner of a model."""
+        self._send(LearnerWake(model))
 
     def versions(self) -> Collection[Key]:
         """Return the versions in memory."""

@@ -82,7 +82,10 @@ def rename(name: str) -> None:
 
 
 def call(function: Callable[..., object], *given: object) -> None:
-    """Call a function in a process of its own, as it may start threads; raise its error."""
+    """Call a function in a process of its own, as it may start threads; raise its error.
+
+    Raise ChildProcessError if the process ends otherwise.
+    """
     reading, writing = os.pipe()
 
     def work() -> None:
@@ -95,9 +98,11 @@ def call(function: Callable[..., object], *given: object) -> None:
     os.close(writing)
     with open(reading, "rb") as pipe:
         content = pipe.read()
-    os.waitpid(pid, 0)
+    _, status = os.waitpid(pid, 0)
     if content:
         raise pickle.loads(content)  # noqa: S301 - of a process of this program
+    if status:
+        raise ChildProcessError(f"a process ended with exit code {os.waitstatus_to_exitcode(status)}")
 
 
 def adopt_orphans() -> None:
@@ -106,9 +111,12 @@ def adopt_orphans() -> None:
 
 
 def kill_orphans(kept: Container[int | None]) -> bool:
-    """Kill the children of this process and its group, but some; return whether there were any."""
-    group = os.getpgrp()
-    orphans = [pid for pid in children() if pid not in kept and _group(pid) == group]
+    """Kill the children of this process and its group, but some; return whether there were any.
+
+    A container's first process also adopts processes that others have started in the container, in other groups.
+    """
+    group = os.getpgrp()  # 0: a group from outside the container
+    orphans = [pid for pid in children() if pid not in kept and group and _group(pid) == group]
     for pid in orphans:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -116,9 +124,11 @@ def kill_orphans(kept: Container[int | None]) -> bool:
 
 
 def children() -> list[int]:
-    """Return the ids of the children of this process, which has one thread."""
+    """Return the ids of the children of this process, which has one thread; none if the kernel does not list them."""
     pid = os.getpid()
-    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    with suppress(FileNotFoundError):
+        return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return []
 
 
 def _group(pid: int) -> int | None:

@@ -121,10 +121,11 @@ class Nursery:
 _nursery: Nursery | None = None
 
 
-def start() -> None:
+def start() -> Nursery:
     """Fork the nursery of this process; call it before any thread starts."""
     global _nursery  # noqa: PLW0603 - one a process
     _nursery = Nursery()
+    return _nursery
 
 
 def current() -> Nursery | None:
@@ -149,7 +150,10 @@ def _tend(channel: socket.socket) -> None:
 
 def _answer(channel: socket.socket, handles: dict[int, int]) -> bool:
     """Fork the process that the next message requests; return False if the parent is gone."""
-    request, given, _, _ = socket.recv_fds(channel, MAX_REQUEST_BYTES, 1)
+    try:
+        request, given, _, _ = socket.recv_fds(channel, MAX_REQUEST_BYTES, 1)
+    except ConnectionResetError:  # it had exit codes to read
+        return False
     if not request:
         return False
     connection = Connection(given[0])
@@ -164,11 +168,22 @@ def _answer(channel: socket.socket, handles: dict[int, int]) -> bool:
 
     try:
         pid = forking.fork(work, name)
+    except OSError as error:
+        channel.send(pickle.dumps((0, error)))
+    else:
+        _report(channel, handles, pid)
+    connection.close()
+    return True
+
+
+def _report(channel: socket.socket, handles: dict[int, int], pid: int) -> None:
+    """Send a handle of a process that was forked; kill the process if the kernel has no handles."""
+    try:
         handle = os.pidfd_open(pid)
     except OSError as error:
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
         channel.send(pickle.dumps((0, error)))
     else:
         handles[handle] = pid
         socket.send_fds(channel, [pickle.dumps((pid, None))], [handle])
-    connection.close()
-    return True

@@ -20,7 +20,7 @@ COUNTS, REALS, NAME_BYTES = 24, 8, 256
 """Numbers of a tally of each type, and max size of its name: those of 19 buckets fit."""
 _NUMBER = 8
 RECORD_BYTES = NAME_BYTES + _NUMBER * (COUNTS + REALS)
-MAX_TALLIES = 8000
+MAX_TALLIES = 32_000
 """Tallies of one process. Further ones are of this process alone, and are lost when it ends."""
 HEADER_BYTES = 512
 """Of a part: the number of its tallies, its process, then its gauges."""
@@ -50,10 +50,10 @@ def new_tally() -> Tally:
 class Gauge:
     """A number of things that are open now."""
 
-    __slots__ = ("_own", "_parts")
+    __slots__ = ("_others", "_own")
 
-    def __init__(self, own: Counts, parts: Sequence[Counts]) -> None:
-        self._own, self._parts = own, parts
+    def __init__(self, own: Counts, others: Sequence[Counts] = ()) -> None:
+        self._own, self._others = own, others
 
     def add(self, number: int) -> None:
         """Add a number, which may be negative."""
@@ -62,13 +62,15 @@ class Gauge:
     @property
     def total(self) -> int:
         """The number in all processes."""
-        return sum([part[0] for part in self._parts])
+        total = self._own[0]
+        for other in self._others:
+            total += other[0]
+        return total
 
 
 def new_gauge() -> Gauge:
     """Return a gauge of this process alone."""
-    alone = [0]
-    return Gauge(alone, [alone])
+    return Gauge([0])
 
 
 class CounterMemory:
@@ -135,7 +137,7 @@ class Counters:
     def _gauge(self, place: int) -> Gauge:
         if self._own is None:
             return new_gauge()
-        return Gauge(self._own.gauge(place), [part.gauge(place) for part in self._parts])
+        return Gauge(self._own.gauge(place), [part.gauge(place) for part in self._parts if part is not self._own])
 
 
 class _Part:

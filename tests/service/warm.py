@@ -15,6 +15,7 @@ from multiprocessing import current_process, forkserver, parent_process, popen_f
 from multiprocessing.connection import wait
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
+from socket import socket
 from threading import Lock
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +28,7 @@ PRELOADED = [
     "service.training.worker",
     "service.learning.learner.worker",
     "service.learning.weigher.worker",
+    "service.planes.workers.process",
     "service.runtime.preload",
     __name__,
 ]
@@ -97,6 +99,13 @@ def warm_processes() -> Iterator[None]:
 
 def _shim() -> SimpleNamespace:
     return SimpleNamespace(get_context=lambda _: _context(), parent_process=parent_process)
+
+
+def fork(name: str, place: object, connection: socket, function: Callable[..., object], *given: Any) -> _Process:
+    """Start a process, as the nursery of a service does."""
+    process = _context().Process(target=function, args=(*given, connection), name=name, daemon=True)
+    process.start()
+    return process
 
 
 class Served:

@@ -37,6 +37,8 @@ class Buckets:
         """Return the place of a client's bucket at a time in s, and the time when it is full."""
         name, size = hash(client) or 1, self._size
         first, free = name % size, -1
+        if self._names[first] == name:
+            return first, max(self._full[first], at)
         for place in chain(range(first, min(first + PLACES, size)), range(min(first, max(0, first + PLACES - size)))):
             if self._names[place] == name:
                 return place, max(self._full[place], at)

@@ -9,6 +9,7 @@ from time import perf_counter
 from anyio import CapacityLimiter
 
 from lipcore.model.torque_model import TorqueModel
+from service.api.elsewhere import Elsewhere
 from service.api.limits.requests import in_turn
 from service.api.oip import query, schema
 from service.api.oip.query import shapes
@@ -18,6 +19,7 @@ from service.api.oip.tensors import Message
 from service.api.route import Reply
 from service.contract.models import ALIAS
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
+from service.inference.predicting import Buffer
 from service.models import registry
 from service.models.loaded import LoadedModels, ServedModel
 from service.models.served import AnsweringModels
@@ -52,30 +54,38 @@ async def infer(
     sequences: Sequences,
     statistics: Statistics,
     turns: CapacityLimiter,
+    elsewhere: Elsewhere,
     name: str,
     version: str | None,
-    size: int,
+    body: bytes,
     decode: Callable[[], Message],
+    decode_elsewhere: Callable[[Buffer], Message],
 ) -> Reply:
-    """Answer an inference request, a single query on the event loop and any other in a thread.
+    """Answer an inference request: a single query on the event loop, a short one in a thread, any other elsewhere.
 
-    `decode` decodes the body, which has `size` bytes. Raise ServiceError for a wrong request.
+    `decode` decodes the body, `decode_elsewhere` does so in another process. Raise ServiceError for a wrong request.
     """
     settings, arrived = loaded.settings, perf_counter()
     served = await find(loaded, turns, name, version)
     timing = Timing()
     try:
-        if size > MAX_INLINE_BYTES:
-            reply = await in_turn(turns, query.infer, served, decode, settings, sequences, arrived, timing)
+        if len(body) > MAX_INLINE_BYTES:
+            long = await elsewhere.run(query.infer_elsewhere, served, body, decode_elsewhere, timing)
+            if long is None:  # of a sequence, whose state is here
+                reply = await in_turn(turns, query.infer, served, decode, settings, sequences, arrived, timing)
         else:
-            message = decode()
+            message, long = decode(), None
             task = query.read_task(served, message, settings)
             task = query.follow_sequence(served, message, task, sequences, arrived)
             timing.note_read(task.query.values.shape[1])
             if task.is_inline:
                 reply = query.respond(served, message, task)
+            elif task.is_long and task.deflections is None:
+                long = await elsewhere.run(query.infer_elsewhere, served, body, decode_elsewhere, timing)
             else:
                 reply = await in_turn(turns, query.respond, served, message, task, timing)
+        if long is not None:
+            reply, timing = Reply(*long[0]), long[1]
     except Exception:
         statistics.fail(served.name, served.version, timing)
         raise

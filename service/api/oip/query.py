@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,9 @@ from service.foundation.settings import Settings
 from service.inference.predicting import (
     FORWARD,
     MAX_BINARY_BATCH,
+    MAX_SHORT_BATCH,
     QUANTITIES,
+    Buffer,
     Query,
     check_answer,
     check_count,
@@ -32,6 +34,7 @@ from service.inference.predicting import (
 )
 from service.inference.wrench import wrenches
 from service.models.loaded import ServedModel
+from service.storage.storage import Storage
 
 Array = NDArray[np.float64]
 Shape = tuple[int, ...]
@@ -120,6 +123,13 @@ class InferTask(NamedTuple):
     def is_inline(self) -> bool:
         """Whether the task is cheap enough for the event loop: a single query without components."""
         return self.query.values.shape[1] == 1 and self.outputs.keys() <= INLINE_OUTPUTS
+
+    @property
+    def is_long(self) -> bool:
+        """Whether the task takes so long that it must not be computed beside control loops."""
+        cheap = self.outputs.keys() <= INLINE_OUTPUTS - ARM_OUTPUTS.keys()
+        rows: int = self.query.values.shape[1]
+        return rows > (MAX_SHORT_BATCH if cheap else 1)
 
 
 def read(message: Message, model: TorqueModel, settings: Settings) -> InferTask:
@@ -303,6 +313,22 @@ def infer(
     task = follow_sequence(served, message, task, sequences, arrived)
     timing.note_read(task.query.values.shape[1])
     return respond(served, message, task)
+
+
+def infer_elsewhere(
+    storage: Storage, served: ServedModel, body: Buffer, decode: Callable[[Buffer], Message], timing: Timing
+) -> tuple[tuple[Any, ...], Timing] | None:
+    """Decode a request and answer it; return the fields of the reply, and its times. Raise as `infer` does.
+
+    Return None for a request of a sequence of a model that remembers it.
+    """
+    timing.start()
+    message = decode(body)
+    if served.model.remembers and read_part(message.request) is not None:
+        return None
+    task = read_task(served, message, storage.settings)
+    timing.note_read(task.query.values.shape[1])
+    return tuple(respond(served, message, task)), timing
 
 
 def read_task(served: ServedModel, message: Message, settings: Settings) -> InferTask:

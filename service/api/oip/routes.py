@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable
 from enum import Enum
 from functools import partial
 
@@ -12,6 +13,7 @@ from starlette.types import Scope
 from service import __version__
 from service.api.access.scopes import PREDICT, READ, needs
 from service.api.dependencies import ReadinessDep
+from service.api.elsewhere import Elsewhere
 from service.api.oip import dataplane, schema, wire
 from service.api.route import Reply, Route, hot_route
 from service.api.routes import health
@@ -93,19 +95,25 @@ async def model_ready(request: Request) -> schema.ModelReady:
     return schema.ModelReady(name=served.name)
 
 
-async def _answer(scope: Scope, body: bytes) -> Reply:
+async def _answer(scope: Scope, body: bytes) -> Reply | Awaitable[Reply]:
     """Answer any inference request; raise ServiceError for a wrong one."""
-    state, where = scope["app"].state, scope["path_params"]
-    decode = partial(wire.decode, body, scope["headers"])
+    answer = _infer(scope, body)
+    return answer if len(body) > dataplane.MAX_INLINE_BYTES else await answer
+
+
+async def _infer(scope: Scope, body: bytes) -> Reply:
+    state, where, headers = scope["app"].state, scope["path_params"], scope["headers"]
     return await dataplane.infer(
         state.loaded,
         state.sequences,
         state.statistics,
         state.turns.predictions,
+        Elsewhere(state),
         where["model"],
         where.get("version"),
-        len(body),
-        decode,
+        body,
+        partial(wire.decode, body, headers),
+        partial(wire.decode, headers=headers),
     )
 
 
@@ -147,7 +155,7 @@ async def infer(request: Request) -> Response:
     - `wrench_base_std`, `wrench_link_std` [6]: their standard deviations.
     """
     # only for the documentation: `_answer` answers every request
-    reply = await _answer(request.scope, await request.body())
+    reply = await _infer(request.scope, await request.body())
     return reply.response()
 
 

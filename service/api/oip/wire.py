@@ -25,6 +25,7 @@ from service.api.oip.schema import (
 from service.api.oip.tensors import Answer, Header
 from service.api.route import OCTETS, Reply
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
+from service.inference.predicting import Buffer
 
 _HEADER, _ENCODING = HEADER.lower().encode(), b"content-encoding"
 _decode = msgspec.json.Decoder(InferRequest).decode
@@ -52,7 +53,7 @@ Headers = Iterable[tuple[bytes, bytes]]
 class Message:
     """A request, with the binary data that follow its JSON."""
 
-    def __init__(self, request: InferRequest, body: bytes, offset: int) -> None:
+    def __init__(self, request: InferRequest, body: Buffer, offset: int) -> None:
         self.request, self._body, self._offset = request, body, offset
 
     def is_binary(self, outputs: Iterable[bool]) -> bool:
@@ -102,7 +103,7 @@ class Message:
         return Reply(b"".join([text, *payload]), OCTETS, ((_HEADER, b"%d" % len(text)),))
 
 
-def decode(body: bytes, headers: Headers) -> Message:
+def decode(body: Buffer, headers: Headers) -> Message:
     """Decode the JSON of a body; raise InvalidRequestError, or UnsupportedMediaTypeError if it is compressed.
 
     `headers` are those of the request, with names in lower case.

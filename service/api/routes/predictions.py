@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable
 from enum import Enum
 from typing import Any
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request, Response
+from starlette.datastructures import State
 from starlette.types import Scope
 
 from service.api.access.scopes import PREDICT, needs
 from service.api.dependencies import LoadedModelsDep, PredictionsDep
+from service.api.elsewhere import Elsewhere, ElsewhereDep
 from service.api.errors import responses
+from service.api.limits.requests import in_turn
 from service.api.route import JSON, OCTETS, Reply, Route, hot_route, is_json, media_type
 from service.contract import predictions as schema
 from service.contract.wrench import GravityRequest, GravityResponse, WrenchRequest, WrenchResponse
@@ -25,7 +29,7 @@ from service.foundation.errors import (
 )
 from service.inference import comparison, evaluating, predicting
 from service.inference.gravity import gravity as gravity_torque
-from service.inference.predicting import encode, one_motion, queries
+from service.inference.predicting import MAX_SHORT_BODY, encode, is_long, one_motion, queries, version_of
 from service.inference.wrench import wrench as external_wrench
 from service.models.loaded import LoadedModels
 from service.models.served import AnsweringModels, ServedModel, wait_for_revision
@@ -80,25 +84,31 @@ hot = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS)
 """Route of control loops, matched before all other routes."""
 
 
-async def _answer(scope: Scope, body: bytes) -> Reply | None:
+async def _answer(scope: Scope, body: bytes) -> Reply | Awaitable[Reply | None] | None:
     """Answer a query that needs no further checks; return None for any other.
 
-    A query of a control loop is computed here, any other in a thread.
+    A query of a control loop is computed here, a short one in a thread, any other elsewhere.
     """
-    query = queries.decode(body) if is_json(scope) else None
+    if not is_json(scope):
+        return None
+    state, model = scope["app"].state, scope["path_params"]["model"]
+    if len(body) > MAX_SHORT_BODY:
+        chosen = version_of(body)
+        return None if chosen is None else _answer_long(state, model, chosen, body)
+    query = queries.decode(body)
     if query is None:
         return None
-    state = scope["app"].state
     loaded: LoadedModels = state.loaded
-    model: str = scope["path_params"]["model"]
     reply, served = answer_query(loaded, model, query), None
     if reply is None and query.min_revision is not None:
         served = await wait_for_revision(loaded, model, query.version, query.alias, query.min_revision)
         reply = answer_query(loaded, model, query)
     if reply is not None:
         return reply
+    if is_long(query):
+        return _answer_long(state, model, query, body)
     request = queries.request(query)
-    return None if request is None else Reply(await _in_thread(loaded, state.turns.predictions, model, request, served))
+    return None if request is None else Reply(await _in_thread(state, model, request, served))
 
 
 async def answer_at_once(scope: Scope, body: bytes) -> Reply | None:
@@ -119,34 +129,52 @@ def answer_query(loaded: AnsweringModels, model: str, query: Any) -> Reply | Non
     return None if answer is None else Reply(encode(answer))
 
 
-async def _in_thread(
-    loaded: LoadedModels, turns: CapacityLimiter, model: str, request: schema.PredictRequest, served: ServedModel | None
-) -> bytes:
-    return await to_thread.run_sync(lambda: encode(predicting.predict(loaded, model, request, served)), limiter=turns)
+async def _answer_long(state: State, model: str, chosen: Any, body: bytes) -> Reply | None:
+    """Answer a query with many motions. chosen: its fields `version`, `alias` and `min_revision`."""
+    served = await _find(state.loaded, state.turns.predictions, model, chosen)
+    answer = await Elsewhere(state).run(predicting.predict_body, served, body)
+    return None if answer is None else Reply(answer)
 
 
-async def _revised(
-    loaded: LoadedModels,
-    model: str,
-    request: schema.PredictRequest | GravityRequest | WrenchRequest | schema.EvaluateRequest,
-) -> ServedModel | None:
-    """Wait for the revision that a request asks for and return its version, None if it asks for none."""
-    if request.min_revision is None:
-        return None
-    return await wait_for_revision(loaded, model, request.version, request.alias, request.min_revision)
+async def _in_thread(state: State, model: str, request: schema.PredictRequest, served: ServedModel | None) -> bytes:
+    loaded: LoadedModels = state.loaded
+
+    def predict() -> bytes:
+        found = served or loaded.get(model, request.version, request.alias)
+        return predicting.predict(loaded.storage, found, request)
+
+    return await to_thread.run_sync(predict, limiter=state.turns.predictions)
+
+
+async def _find(loaded: LoadedModels, turns: CapacityLimiter, model: str, chosen: Any) -> ServedModel:
+    """Return the version that a request chooses, once it has reached the request's `min_revision`; raise NotFoundError.
+
+    turns: limits how many versions load at a time.
+    """
+    revision: int | None = chosen.min_revision
+    if revision is not None:
+        return await wait_for_revision(loaded, model, chosen.version, chosen.alias, revision)
+    served = loaded.hot(model, chosen.version, chosen.alias)
+    if served is not None:
+        return served
+    return await in_turn(turns, loaded.get, model, chosen.version, chosen.alias)
 
 
 @needs(PREDICT)
 async def predict(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.PredictRequest
+    loaded: LoadedModelsDep,
+    turns: PredictionsDep,
+    elsewhere: ElsewhereDep,
+    model: str,
+    request: schema.PredictRequest,
 ) -> Response:
     """Predict the torque of one query or a batch, with its standard deviation.
 
     Inputs and outputs are not clipped. `tau_std` grows far from the training data.
     """
     # correct queries are answered by `_answer`. The others have an error to explain, or unusual JSON
-    served = await _revised(loaded, model, request)
-    return Reply(await _in_thread(loaded, turns, model, request, served)).response()
+    served = await _find(loaded, turns, model, request)
+    return Reply(await elsewhere.run(predicting.predict, served, request)).response()
 
 
 hot.add_api_route(
@@ -160,66 +188,82 @@ hot.add_api_route(
 )
 
 
-@router.post("/{model}/gravity", summary="Return the gravity torque", responses=_LATE)
+@router.post("/{model}/gravity", summary="Return the gravity torque", response_model=GravityResponse, responses=_LATE)
 @needs(PREDICT)
 async def gravity(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: GravityRequest
-) -> GravityResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, elsewhere: ElsewhereDep, model: str, request: GravityRequest
+) -> Response:
     """Return the torque that holds the arm against gravity at one posture or a batch, with its standard deviation.
 
     It needs neither `dq` nor `ddq`. A torque without gravity is the component `without_gravity` of `predict`.
     """
-    served = await _revised(loaded, model, request)
-    return await to_thread.run_sync(gravity_torque, loaded, model, request, served, limiter=turns)
+    return await elsewhere.answer(
+        gravity_torque, await _find(loaded, turns, model, request), request, request.q.ndim == 1
+    )
 
 
-@router.post("/{model}/wrench", summary="Return the external wrench", responses=_LATE)
+@router.post("/{model}/wrench", summary="Return the external wrench", response_model=WrenchResponse, responses=_LATE)
 @needs(PREDICT)
-async def wrench(loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: WrenchRequest) -> WrenchResponse:
+async def wrench(
+    loaded: LoadedModelsDep, turns: PredictionsDep, elsewhere: ElsewhereDep, model: str, request: WrenchRequest
+) -> Response:
     """Return the force and moment on the last link or a tool that explain a measured torque, with their covariance.
 
     Only for models with the geometry of a URDF (`fixed` or `calibrate`) and at least 6 joints. It is not a safety
     function. Friction does not follow the motion before a state.
     """
-    served = await _revised(loaded, model, request)
-    return await to_thread.run_sync(external_wrench, loaded, model, request, served, limiter=turns)
+    return await elsewhere.answer(
+        external_wrench, await _find(loaded, turns, model, request), request, request.q.ndim == 1
+    )
 
 
-@router.post("/{model}/evaluate", summary="Evaluate a model on a data set", responses=_LATE)
+@router.post(
+    "/{model}/evaluate",
+    summary="Evaluate a model on a data set",
+    response_model=schema.EvaluateResponse,
+    responses=_LATE,
+)
 @needs(PREDICT)
 async def evaluate(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.EvaluateRequest
-) -> schema.EvaluateResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, elsewhere: ElsewhereDep, model: str, request: schema.EvaluateRequest
+) -> Response:
     """Return error, coverage and negative log predictive density of the predicted torque for every joint."""
-    served = await _revised(loaded, model, request)
-    return await to_thread.run_sync(evaluating.evaluate, loaded, model, request, served, limiter=turns)
+    return await elsewhere.answer(evaluating.evaluate, await _find(loaded, turns, model, request), request)
 
 
-@router.post("/{model}/trace", summary="Trace predictions along a data set", responses=responses(DamagedDataError))
+@router.post(
+    "/{model}/trace",
+    summary="Trace predictions along a data set",
+    response_model=schema.TraceResponse,
+    responses=responses(DamagedDataError),
+)
 @needs(PREDICT)
 async def trace_model(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.TraceRequest
-) -> schema.TraceResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, elsewhere: ElsewhereDep, model: str, request: schema.TraceRequest
+) -> Response:
     """Return measured and predicted torque row by row, for a plot: mean, both standard deviations and components.
 
     If there are more rows than points, evenly spaced rows are returned. The share of points outside the interval is
     representative, but peaks between two points are missing. To see every row, ask for a shorter range.
     """
-    return await to_thread.run_sync(evaluating.trace, loaded, model, request, limiter=turns)
+    served = await in_turn(turns, loaded.get, model, request.version, request.alias)
+    return await elsewhere.answer(evaluating.trace, served, request)
 
 
 @router.post(
     "/{model}/compare",
     summary="Compare two versions on a data set",
     tags=["models"],
+    response_model=schema.CompareResponse,
     responses=responses(NotFoundError, UnreadableVersionError, DamagedDataError),
 )
 @needs(PREDICT)
 async def compare(
-    loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.CompareRequest
-) -> schema.CompareResponse:
+    loaded: LoadedModelsDep, turns: PredictionsDep, elsewhere: ElsewhereDep, model: str, request: schema.CompareRequest
+) -> Response:
     """Return which of two versions predicts a data set better, per joint and over all joints.
 
     The answer also says whether the difference may be due to chance.
     """
-    return await to_thread.run_sync(comparison.compare, loaded, model, request, limiter=turns)
+    versions = await in_turn(turns, comparison.find_versions, loaded, model, request)
+    return await elsewhere.answer(comparison.compare, versions, request)

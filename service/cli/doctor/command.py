@@ -38,7 +38,13 @@ def doctor(
         typer.Option(help="Also measure the torque stream of this model.", autocompletion=connecting.models),
     ] = None,
     seconds: Annotated[
-        float, typer.Option(min=0.05, max=600, help="Duration of each measured loop, s. There are 4 to 16 loops.")
+        float,
+        typer.Option(
+            min=0.05,
+            max=600,
+            help="Duration of each of the 4 to 16 measured loops, s. With less than 1000 ticks, one late tick fails a "
+            "rate: for 100 Hz, measure 10 s.",
+        ),
     ] = 3.0,
     as_json: Json = False,
 ) -> None:
@@ -131,7 +137,7 @@ def _rates(loops: Sequence[Loop]) -> Iterator[Finding]:
 
 RATE = "Highest loop rate"
 IN_PROCESS = "Or load the model in the controller's process, or export C (docs/control-loop.md)."
-SLOW_SERVICE = "The service or the network is late, not the model. Stop other work on both machines. "
+SLOW_SERVICE = "The service or the network is late, not the model. Stop other work on the service's machine. "
 ADVICE: dict[tuple[str, Policy], str] = {
     ("wake-up", "plain"): "Permit SCHED_FIFO, and run the controller with it (`chrt -f 20 …`).",
     ("wake-up", "SCHED_FIFO"): "No controller on this machine is faster. Follow the warnings, or use a slower loop.",

@@ -1,5 +1,6 @@
 """The extensions of uvicorn match the installed and allowed versions, which `HOLDS_FOR` names."""
 
+import logging
 import socket
 import tomllib
 from importlib.metadata import version
@@ -12,8 +13,9 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from service.api.server import HOLDS_FOR
-from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.api.server.connections import GuardedProtocol
 from service.api.server.sockets import Server
+from service.api.server.streams import StreamProtocol
 from service.planes.control import ControlServer
 from service.planes.data import DataServer
 from service.planes.pulse import Pulse
@@ -51,9 +53,10 @@ def test_replaced_methods_exist(kind):
         assert callable(getattr(base, name)), name
 
 
-def test_message_of_a_start_names_the_address(caplog):
+def test_message_of_a_start_names_the_address(caplog, monkeypatch):
     """The data plane logs it itself, as uvicorn logs none for listeners that it is given."""
-    caplog.set_level("INFO")
+    caplog.set_level("INFO", "uvicorn.error")
+    monkeypatch.setattr(logging.getLogger("uvicorn"), "propagate", True)  # other tests configure it
     config = uvicorn.Config(print, port=0, lifespan="off", log_config=None)
     config.load()
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -14,6 +14,9 @@ from service.contract.wrench import GravityRequest
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
 from service.inference.gravity import gravity
+from service.models.loads import StreamPayloads
+from service.models.scales import Scales
+from service.models.served import ServedModel
 from tests import ROOT
 from tests.clients.python.conftest import over
 from tests.service.data import error
@@ -59,24 +62,14 @@ def test_wrong_requests_are_rejected(api, body, field):
     assert error(api.post(URL, json=body), 422, "invalid_request")["detail"][0]["field"] == field
 
 
-class Loaded:
-    """Versions in memory, of which one has this model."""
-
-    def __init__(self, model):
-        self.model = self.default_model = model
-        self.storage = SimpleNamespace(settings=Settings())
-
-    def get(self, *_):
-        return self
-
-
 def test_models_without_gravity_say_so(panda):
-    request = GravityRequest(q=[0.0] * 7)
+    request, scales = GravityRequest(q=[0.0] * 7), Scales(panda.scale)
+    storage = SimpleNamespace(settings=Settings())
     compensated = replace(panda, torque_convention="gravity_compensated")
     black_box = replace(panda, estimator=replace(panda.estimator, name="se"))
     for model, message in ((compensated, "trained on torque without gravity"), (black_box, "its estimator is se")):
         with pytest.raises(InvalidRequestError, match=message):
-            gravity(Loaded(model), "arm", request)
+            gravity(storage, ServedModel("arm", 1, model, model, frozenset(), scales, StreamPayloads()), request)
 
 
 def test_client_returns_parts_that_sum_to_the_torque(api, panda):

@@ -14,6 +14,9 @@ from lipserve import ApiError
 from service.contract.wrench import WrenchRequest
 from service.foundation.errors import InvalidRequestError
 from service.inference.wrench import wrench
+from service.models.loads import StreamPayloads
+from service.models.scales import Scales
+from service.models.served import ServedModel
 from tests import ROOT
 from tests.clients.python.conftest import over
 from tests.service.data import error
@@ -23,24 +26,12 @@ POSE = np.array([[0.0, -1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.
 URL = "/v1/models/panda-sim/wrench"
 
 
-class Loaded:
-    """Versions in memory, of which one has this model."""
+STORAGE: Any = SimpleNamespace(settings=SimpleNamespace(max_position=30.0))
 
-    name, version, revision = "arm", 3, 7
-    storage = SimpleNamespace(settings=SimpleNamespace(max_position=30.0))
 
-    def __init__(self, model: TorqueModel) -> None:
-        self.model = self.default_model = model
-
-    def get(self, *_: Any) -> "Loaded":
-        return self
-
-    @property
-    def scales(self) -> "Loaded":
-        return self
-
-    def of(self, _: None) -> np.ndarray:
-        return 2.0 * self.model.scale
+def served(model: TorqueModel) -> ServedModel:
+    """Return a version with this model, and twice its width factors."""
+    return ServedModel("arm", 3, model, model, frozenset(), Scales(2.0 * model.scale), StreamPayloads(), 7)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +49,7 @@ def test_wrench_is_that_of_lipcore_in_the_shape_of_the_query(known, single, tool
     tau = known.predict(Q, 0.1 * Q, 0.2 * Q).tau + 1.0
     parts = {"q": Q, "dq": 0.1 * Q, "ddq": 0.2 * Q, "tau": tau}
     body = {name: (values[0] if single else values).tolist() for name, values in parts.items()}
-    answer = wrench(Loaded(known), "arm", WrenchRequest(**body, tool=None if tool is None else tool.tolist()))
+    answer = wrench(STORAGE, served(known), WrenchRequest(**body, tool=None if tool is None else tool.tolist()))
     assert (answer.model, answer.version, answer.revision) == ("arm", 3, 7)
     for row in range(1 if single else 2):
         motion = np.stack([Q[row], 0.1 * Q[row], 0.2 * Q[row]])
@@ -80,7 +71,7 @@ def test_wrong_requests_say_why(known, name):
     zero = dict.fromkeys(("dq", "ddq", "tau"), [0.0] * 7)
     body, value = WRONG[name]
     with pytest.raises(InvalidRequestError) as caught:
-        wrench(Loaded(known), "arm", WrenchRequest(**({"q": Q[0].tolist()} | zero | body)))
+        wrench(STORAGE, served(known), WrenchRequest(**({"q": Q[0].tolist()} | zero | body)))
     assert str(caught.value.detail[0].value).startswith(value)
 
 

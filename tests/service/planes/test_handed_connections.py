@@ -1,13 +1,18 @@
 """What a connection keeps when it passes between the planes: its client, its limits, its unsent answers."""
 
+import gc
 import json
 import os
 import socket
+from contextlib import suppress
 
 import pytest
+from websockets.sync.client import connect
 
 from service.api.limits.requests import COUNTED, ClientPatience
-from tests.service.api.limits.serving import RawConnection
+from service.api.server.connections import GuardedProtocol
+from service.api.server.streams import StreamProtocol
+from tests.service.api.limits.serving import RawConnection, Serving
 from tests.service.data import DEADLINE, eventually
 from tests.service.planes.requests import ECHO, HOST, PAGE, Digest, echo
 from tests.service.planes.two_planes import TwoPlanes
@@ -142,3 +147,53 @@ def test_queries_are_answered_without_a_control_plane(planes):
         assert "control plane" in message
         assert planes.refusal(echo(b"later"))[:2] == (503, "not_ready")
         assert other.ask(echo(b"abc"))[0] == 200  # by the control plane, which cannot pass it back
+
+
+@pytest.mark.parametrize("kind", [Serving, TwoPlanes])
+@pytest.mark.parametrize("request_bytes", [echo(b"abc"), echo(b"later"), PAGE], ids=["query", "handed over", "page"])
+def test_client_that_sends_nothing_more_gets_its_answer(kind, request_bytes):
+    with kind(with_app=Digest()) as serving, serving.connect(request_bytes) as client:
+        client.socket.shutdown(socket.SHUT_WR)
+        assert client.read_answer()[0] == 200
+        assert client.read_to_end() == b""
+
+
+def test_connection_on_its_way_to_a_control_plane_that_ends_is_closed(planes):
+    planes.planes.close()
+    waiting, _ = planes.accepting.accept()  # the next control plane, which reads nothing
+    with planes.connect() as client:
+        assert client.ask(echo(b"abc"))[0] == 200
+        eventually(lambda: planes.link.is_connected)
+        client.send(PAGE)
+        eventually(lambda: planes.link.passed.count(None) == 1)
+        waiting.close()
+        with suppress(ConnectionResetError):
+            assert client.socket.recv(1) == b""
+        eventually(lambda: planes.link.passed.count(None) == 0)
+
+
+def test_query_that_waits_for_a_revision_wakes_the_learner(planes):
+    planes.link.loaded.wake("arm")
+    eventually(lambda: planes.loaded.woken == ["arm"])
+
+
+def connections_in_memory():
+    return sum(issubclass(type(each), (GuardedProtocol, StreamProtocol)) for each in gc.get_objects())
+
+
+@pytest.mark.parametrize("kind", [Serving, TwoPlanes])
+def test_closed_connections_need_no_garbage_collection(kind):
+    with kind() as serving:
+        gc.collect()
+        before = connections_in_memory()
+        gc.disable()
+        try:
+            for request in (echo(b"abc"), PAGE, echo(b"later")):
+                with serving.connect() as client:
+                    assert [client.ask(request)[0] for _ in range(2)] == [200, 200]
+            with connect(f"ws://127.0.0.1:{serving.port}/v1/echo/stream") as stream:
+                stream.send(b"abc")
+                assert stream.recv(DEADLINE) == b"abc"
+            eventually(lambda: connections_in_memory() == before, 10)
+        finally:
+            gc.enable()

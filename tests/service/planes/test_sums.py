@@ -5,9 +5,10 @@ import re
 import signal
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -36,9 +37,9 @@ LIVE, READY = "/health/live", "/health/ready"
 FRAMES = 20
 
 
-def two_planes(home: Path, **settings: str) -> Server:
-    """Return a service with two planes that has its model in both."""
-    server = Server(home, warm=True, LIPSERVE_DATA_PLANE="on", **settings)
+def two_planes(home: Path, constants: Mapping[str, Any] | None = None, **settings: str) -> Server:
+    """Return a service with two planes that has its model in both. constants: as of `Server`."""
+    server = Server(home, warm=True, constants=constants, LIPSERVE_DATA_PLANE="on", **settings)
     with httpx.Client(base_url=server.url) as client:
         if "LIPSERVE_KEYS" not in settings:
             eventually(lambda: client.post(PREDICT, json=MOTION).is_success)

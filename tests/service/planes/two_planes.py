@@ -33,6 +33,12 @@ class NoModels:
 
     def __init__(self) -> None:
         self.changes, self.snapshot = Changes(), Snapshot()
+        self.woken: list[str] = []
+        """Models whose learner was woken."""
+
+    def wake(self, model: str) -> None:
+        """Wake a learner."""
+        self.woken.append(model)
 
 
 class QueriesApp:
@@ -79,6 +85,7 @@ class TwoPlanes(Serving):
     ) -> None:
         super().__init__(notice_s, drain_s, patience, with_app, **limits)
         self.queries, self.settings, self.unix = QueriesApp(self.app), Settings(**limits), unix
+        self.loaded = NoModels()
         self.folder = Path(mkdtemp(prefix="planes-"))
         self.accepting = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.accepting.bind(str(self.folder / "link"))
@@ -106,7 +113,8 @@ class TwoPlanes(Serving):
         made = partial(guarded, patience=self.patience)
         self.server.config.load()
         self.server.lifespan = self.server.config.lifespan_class(self.server.config)
-        state = SimpleNamespace(storage=SimpleNamespace(settings=self.settings), learners=None, loaded=NoModels())
+        state = SimpleNamespace(storage=SimpleNamespace(settings=self.settings), loaded=self.loaded)
+        state.learners = SimpleNamespace(loaded=self.loaded)
         state.keyring, state.confirmations = None, Confirmations()
         with patch.object(dataplanes, "guarded", made):
             self.planes = dataplanes.DataPlanes(SimpleNamespace(state=state), self.server)

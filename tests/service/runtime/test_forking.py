@@ -58,6 +58,8 @@ def test_called_function_runs_elsewhere_and_its_error_comes_back():
 
     with pytest.raises(NotFoundError, match="gone"):
         forking.call(fail)
+    with pytest.raises(ChildProcessError, match="exit code -9"):
+        forking.call(lambda: os.kill(os.getpid(), signal.SIGKILL))
 
 
 def test_process_with_threads_is_told_what_to_do():
@@ -102,3 +104,26 @@ def test_forked_processes_have_request_ids_of_their_own():
     os.close(reading)
     os.close(writing)
     assert len({each.partition("-")[0] for each in ids}) == 3
+
+
+def test_orphans_of_the_own_group_are_killed():
+    kept, orphan, other = (forking.fork(work, "test") for work in (signal.pause, signal.pause, leave_group))
+    try:
+        eventually(lambda: os.getpgid(other) == other)
+        others = {pid for pid in forking.children() if pid not in (kept, orphan, other)}
+        assert forking.kill_orphans({kept, *others})
+        _, status = os.waitpid(orphan, 0)
+        assert os.waitstatus_to_exitcode(status) == -signal.SIGKILL
+        assert is_running(kept)
+        assert is_running(other)
+        assert not forking.kill_orphans({kept, *others})
+    finally:
+        for pid in (kept, other):
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+
+
+def leave_group():
+    """Wait in a group of its own."""
+    os.setpgid(0, 0)
+    signal.pause()

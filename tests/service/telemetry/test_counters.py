@@ -6,6 +6,7 @@ from threading import Thread
 
 import pytest
 
+from service.learning.live.status import AnswerCounter
 from service.telemetry import counters
 from service.telemetry.counters import CounterMemory, Counters
 from service.telemetry.meters import Kind, Meters
@@ -57,6 +58,20 @@ def test_streams_are_sums_by_model_and_error():
         assert (sum(totals["arm"].durations.counts), totals["arm"].durations.total) == (3, 0.75)
         assert (totals["arm"].late, totals["arm"].refused) == (3, {"invalid_request": 3})
         assert (totals["other arm"].late, totals["other arm"].refused) == (0, {"busy": 1})
+
+
+def test_live_feed_counts_the_answers_of_all_processes():
+    memory = CounterMemory(2)
+    here, there = (Meters(counters=Counters(memory, part)) for part in range(2))
+    counter = AnswerCounter(here, "arm")
+    there.stream("arm").durations.add(0.25)
+    assert counter.since(None) is None
+    for meters in (here, there, there):
+        meters.stream("arm").durations.add(0.25)
+        meters.stream("arm").count_late()
+    there.stream("arm").refuse("busy")
+    seen = counter.since(1.0)
+    assert (seen.count, seen.late, seen.refused, seen.p50_at_most_s) == (3, 3, 1, 0.25)
 
 
 def test_gauges_of_a_killed_process_end_with_it():

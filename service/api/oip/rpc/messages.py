@@ -15,6 +15,7 @@ from service.api.oip.rpc.definition import message
 from service.api.oip.tensors import Answer, Header
 from service.api.route import Reply
 from service.foundation.errors import invalid_request
+from service.inference.predicting import Buffer
 
 PROTOBUF = b"application/grpc"
 InferRequest, InferResponse = message("ModelInferRequest"), message("ModelInferResponse")
@@ -34,6 +35,11 @@ def decode(kind: Any, data: bytes) -> Any:
         expected = kind.DESCRIPTOR.full_name
         sentence = f"The message is not a valid {expected}: {error}"
         raise invalid_request("the message", f"not valid protobuf: {error}", expected, sentence) from error
+
+
+def decode_request(data: Buffer) -> Message:
+    """Decode an InferRequest; raise InvalidRequestError."""
+    return Message(decode(InferRequest, bytes(data)))
 
 
 def encode(answer: Any) -> Reply:

@@ -17,9 +17,10 @@ from starlette.types import Receive, Scope, Send
 
 from service import __version__
 from service.api.access.scopes import PREDICT, READ, Rule
+from service.api.elsewhere import Elsewhere
 from service.api.oip import dataplane, extensions, schema
 from service.api.oip.rpc.definition import SERVICE, message
-from service.api.oip.rpc.messages import InferRequest, Message, decode, encode
+from service.api.oip.rpc.messages import InferRequest, Message, decode, decode_request, encode
 from service.api.route import Reply
 from service.api.routes import health
 from service.foundation.errors import NotReadyError, invalid_request
@@ -112,10 +113,12 @@ async def _model_infer(state: State, scope: Scope, body: bytes) -> Reply:
         state.sequences,
         state.statistics,
         state.turns.predictions,
+        Elsewhere(state),
         name,
         version,
-        len(body),
+        body,
         partial(Message, sent),
+        decode_request,
     )
 
 
