@@ -87,6 +87,7 @@ def test_worker_of_a_client_that_disconnects_is_killed(service):
         client.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
         client.shutdown(socket.SHUT_WR)
     eventually(lambda: not all(is_running(pid) for pid in stopped))
+    eventually(lambda: 'status="499"' in service.client.get("/metrics").text)
     for pid in filter(is_running, stopped):
         os.kill(pid, signal.SIGCONT)
     predict(service)
