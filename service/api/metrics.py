@@ -88,7 +88,7 @@ def _processes(counters: Counters) -> Iterator[Metric]:
 def _kind_of(process: str) -> str:
     """Return the label of a process by its name."""
     name = process.removeprefix("lipserve-")
-    return name if name in ("learner", "weigher") else "training"
+    return name if name in ("learner", "weigher", "worker") else "training"
 
 
 class Traffic(Collector):
