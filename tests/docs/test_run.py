@@ -76,5 +76,6 @@ def test_quick_blocks_of_page_run(runner, page):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", SLOW_PAGES, ids=page_id)
 def test_all_blocks_of_page_run(tmp_path, page):
-    with Server(tmp_path / "home") as server:
+    # tests run in parallel: a training with the usual low priority would hardly run
+    with Server(tmp_path / "home", LIPSERVE_TRAINING_NICENESS="0", LIPSERVE_LEARNER_NICENESS="0") as server:
         run_blocks(BlockRunner(tmp_path, server), page, slow=True)

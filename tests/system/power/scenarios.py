@@ -223,8 +223,8 @@ class RecordedService:
             acknowledged[f"alias/{ARM}/serving"] = version
         return version
 
-    def import_version(self, model: str, version: int) -> None:
-        """Import a version as the next one of a model; the first one serves."""
+    def import_version(self, model: str, version: int) -> int:
+        """Import a version as the next one of a model; return the serving version."""
         with self.client.stream("GET", f"/v1/models/{ARM}/export", params={"version": 1, "learnt": False}) as answer:
             archive = answer.read()
             assert answer.is_success, archive
@@ -233,8 +233,10 @@ class RecordedService:
             answer = self._post("/v1/models/import", MEDIA_TYPE, archive, name=model)
             assert answer["version"] == version
             acknowledged[made] = answer["created_at"]
-            acknowledged[serving] = self._check_success(self.client.get(f"/v1/models/{model}"))["serving_version"]
-            assert version > 1 or acknowledged[serving] == 1
+            answers: int = self._check_success(self.client.get(f"/v1/models/{model}"))["serving_version"]
+            acknowledged[serving] = answers
+            assert version > 1 or answers == 1
+        return answers
 
     def delete_version(self, model: str, version: int) -> None:
         """Delete a version."""
@@ -326,11 +328,11 @@ def _run_versions(service: RecordedService, number: int) -> None:
         service.move_alias("production", version)
     service.import_version(f"imported-{number}", 1)
     service.serve(1)
-    service.import_version(f"imported-{number}", 2)
-    service.delete_version(f"imported-{number}", 2)
+    serving = service.import_version(f"imported-{number}", 2)
+    service.delete_version(f"imported-{number}", 3 - serving)
     service.serve(2)
     service.remove_alias("production")
-    service.delete_model(f"imported-{number}", 1)
+    service.delete_model(f"imported-{number}", serving)
 
 
 def run_each_kind(service: RecordedService, number: int, serving: int = 1) -> None:
