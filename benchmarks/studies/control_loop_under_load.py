@@ -32,11 +32,13 @@ import numpy as np
 
 from benchmarks.clients import TIMEOUT
 from benchmarks.latency.websocket import WebSocket, frame
-from benchmarks.online.bed import Bed, serving
+from benchmarks.online.bed import Bed, install, serving
 from benchmarks.studies.worst_loads import ARM, LOADS, MODEL, prepare
 from lipcore.data.samples import Array
 from lipserve.frames import ANSWER, ERROR, REQUEST
+from service.contract.observations import LearningOptions
 
+PANDA = Path(__file__).parents[2] / "models" / "panda-sim"
 FRAME = np.array([[0.1, -0.1, 0.0, -1.8, 0.2, 1.6, 0.3], np.zeros(7), np.zeros(7)])
 SPIN_S = 50e-6
 """The client sleeps until this time before a frame is due, then it polls the clock."""
@@ -173,6 +175,7 @@ def main() -> None:
         results: dict[str, list[dict[str, Measured]]] = {}
         homes = {each: Path(folder) / each for each in given.planes}
         first, *others = homes.values()
+        install(first, PANDA, {ARM: LearningOptions()}, 7)
         with serving(first, _settings(given.planes[0])) as bed:
             prepare(bed.client)
         for home in others:

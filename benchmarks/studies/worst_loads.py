@@ -35,15 +35,13 @@ FAILURES = (OSError, http.client.HTTPException, lipserve.ApiError, lipserve.Serv
 
 
 def prepare(client: Client) -> None:
-    """Upload a recording and train a model that learns."""
+    """Upload a recording."""
     samples = simulate(load_robot("panda"), Simulation(ROWS, 100.0, speed=3.0, noise=0.05), 0)
     columns = {"t": samples.t} | {name: getattr(samples, name) for name in ("q", "dq", "ddq", "tau")}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{DATA}.npz"
         np.savez(path, **columns)
         client.upload(path, DATA)
-    client.wait(client.train(ARM, [DATA], "lip-chain", options=QUICK, promotion="always"))
-    client.set_learning(ARM, enabled=True)
 
 
 def body_of(size: int) -> bytes:

@@ -164,7 +164,10 @@ def hot_route(answer: PatientAnswerer) -> type[Route]:
                 return
             reply = await answer(scope, body)
             if reply is not None and not isinstance(reply, Reply):
-                reply = await unless_disconnected(receive, reply)
+                try:
+                    reply = await unless_disconnected(receive, reply)
+                except ClientDisconnect:
+                    return
             if reply is None:
                 await super().handle(scope, _again(body, receive), send)
                 return

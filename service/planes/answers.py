@@ -21,7 +21,7 @@ from service.api.oip.statistics import Statistics
 from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
 from service.api.route import Answerer
 from service.api.routes import health, predictions
-from service.api.server.connections import CONNECTION as STREAM
+from service.api.server.streams import CONNECTION as STREAM
 from service.api.shared import Shared
 from service.api.stream import routes as stream
 from service.foundation.errors import NotFoundError, NotReadyError, ServiceError

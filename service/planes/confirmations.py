@@ -23,9 +23,9 @@ class Confirmations:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._waiting: list[tuple[int, asyncio.Future[None]]] = []
 
-    def start(self, changes: Changes) -> None:
-        """Count these changes. Call it in the event loop whose answers shall wait."""
-        self._changes, self._loop = changes, asyncio.get_running_loop()
+    def watch(self, changes: Changes) -> None:
+        """Count these changes."""
+        self._changes = changes
 
     def confirm(self, number: float) -> None:
         """Note that the data plane answers with the changes up to a number; `inf` if no data plane answers."""
@@ -39,8 +39,9 @@ class Confirmations:
         return self._changes.number > self._confirmed
 
     async def wait(self) -> None:
-        """Wait until the data plane answers with all changes up to now, at most MAX_WAIT_S."""
-        done = asyncio.get_running_loop().create_future()
+        """Wait until the data plane answers with all changes up to now, at most MAX_WAIT_S; in one event loop."""
+        self._loop = asyncio.get_running_loop()
+        done = self._loop.create_future()
         entry = self._changes.number, done
         self._waiting.append(entry)
         self._wake()  # it may have been confirmed meanwhile

@@ -10,7 +10,8 @@ from typing import Any, ClassVar
 from service.api.limits.requests import COUNTED, HEALTH
 from service.api.requests import HANDED_OVER
 from service.api.server.connection_limit import Excess
-from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.api.server.connections import GuardedProtocol
+from service.api.server.streams import StreamProtocol
 from service.planes.counting import PassedConnections
 from service.planes.handover import OTHER, PART, Handed, PassOn, find_query, refuse_connection, shared
 

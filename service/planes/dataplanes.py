@@ -40,7 +40,7 @@ class DataPlanes:
         )
         self._connections = AdoptedConnections(kind.limit, server.server_state.connections, self._broadcast)
         self._publisher = Publisher(app.state.loaded, app.state.keyring, app.state.confirmations)
-        app.state.confirmations.start(app.state.loaded.changes)
+        app.state.confirmations.watch(app.state.loaded.changes)
         self._publisher.start()
         self._reporting = self._loop.create_task(self._connections.report())
 

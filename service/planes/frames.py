@@ -16,9 +16,12 @@ from service.learning.ingest.frames import Frames, FramesResult
 from service.learning.learners import Learners
 from service.models.served import AnsweringModels
 
-MAX_WAIT_S = 0.8
-"""Max wait of frames for the control plane, s: less than a stream of 1 kHz collects until it stops reading."""
-RESEND_S = 0.02
+MAX_WAIT_S = 2.0
+"""Max wait of frames for the control plane, s: a restart takes less, and a stream of 1 kHz is read for twice as
+long."""
+MAX_FURTHER_WAIT_S = 0.02
+"""The same while it has not answered since earlier frames were refused: a stream is not read less often for it."""
+RESEND_S = 0.01
 """Pause before frames are sent again, s."""
 
 
@@ -55,6 +58,7 @@ class RemoteLearners:
         self.settings, self.loaded, self._send = settings, loaded, send
         self._numbers = itertools.count()
         self._waiting: dict[int, asyncio.Future[FramesResult | ServiceError | None]] = {}
+        self._silent = False  # since frames were refused
 
     async def log_frames(self, model: str, make: Callable[[], Frames], arrived: float) -> FramesResult:
         """Let the control plane log frames; return its result once they are durable. Raise ServiceError.
@@ -62,11 +66,12 @@ class RemoteLearners:
         They are sent again to a control plane that was started meanwhile: it knows which sequences were logged.
         """
         frames, loop, number = make(), asyncio.get_running_loop(), next(self._numbers)
-        served, until, without = frames.served, monotonic() + MAX_WAIT_S, cast(Any, None)
+        patience = MAX_FURTHER_WAIT_S if self._silent else MAX_WAIT_S
+        served, until, without = frames.served, monotonic() + patience, cast(Any, None)
         message = FramesToLog(number, replace(frames, served=without), served.version, served.revision, arrived, until)
         result: FramesResult | ServiceError | None = None
         try:
-            async with asyncio.timeout(MAX_WAIT_S):
+            async with asyncio.timeout(patience):
                 while result is None:
                     self._waiting[number] = done = loop.create_future()
                     if self._send(message):
@@ -74,6 +79,7 @@ class RemoteLearners:
                     if result is None:
                         await asyncio.sleep(RESEND_S)
         except TimeoutError:
+            self._silent = True
             raise frames_lost() from None
         finally:
             self._waiting.pop(number, None)
@@ -82,7 +88,8 @@ class RemoteLearners:
         return result
 
     def receive(self, message: FramesLogged) -> None:
-        """Pass a result to the stream that waits for it."""
+        """Pass a result to the stream that waits for it, if any still does."""
+        self._silent = False
         if (done := self._waiting.get(message.number)) is not None and not done.done():
             done.set_result(message.result)
 
@@ -115,7 +122,7 @@ async def log_frames(learners: Learners, message: FramesToLog) -> FramesLogged:
 def frames_lost() -> NotReadyError:
     """Return the error for a client whose frames the control plane has not acknowledged in time."""
     return NotReadyError(
-        f"The part of the service that learns has not answered for {MAX_WAIT_S:g} s. Torques are still answered. It is "
-        "unknown whether these frames are stored: reconnect and send them again with the same sequences. Stored frames "
-        "are then counted as duplicates."
+        "The part of the service that learns does not answer now. Torques are still answered. It is unknown whether "
+        "these frames are stored: reconnect and send them again with the same sequences. Stored frames are then "
+        "counted as duplicates."
     )

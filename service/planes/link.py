@@ -103,7 +103,7 @@ class ControlLink:
             except OSError:
                 time.sleep(RECONNECT_S)
                 continue
-            channel.send(self.loaded.holdings())
+            channel.send(self.loaded.start_connection())
             while (received := channel.receive()) is not None:
                 try:
                     self._handle(*received)

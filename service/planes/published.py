@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -100,8 +100,12 @@ class PublishedModels:
         """Let the control plane wake the learner of a model."""
         self._send(LearnerWake(model))
 
-    def holdings(self) -> Holdings:
-        """Return the first message to a control plane. It sends all payloads again."""
+    def versions(self) -> Collection[Key]:
+        """Return the versions in memory."""
+        return self._snapshot.served.keys()
+
+    def start_connection(self) -> Holdings:
+        """Return the first message to a control plane; forget the payloads of the one before, which are sent again."""
         self._with_payload.clear()
         return Holdings({key: each.revision for key, each in self._snapshot.served.items()}, self._answers)
 

@@ -88,8 +88,8 @@ class Publisher:
         self, subscriber: Subscriber, number: int, packages: dict[Any, Package], closing: ExitStack
     ) -> bool:
         """Send a data plane what it lacks; return whether it can be reached. packages: of large messages, for all."""
-        channel = subscriber.channel
-        for message in subscriber.changes(self._loaded.snapshot, self._numbers, number):
+        channel, is_complete = subscriber.channel, subscriber.is_complete  # before the snapshot, which has all then
+        for message in subscriber.changes(self._loaded.snapshot, self._numbers, number, is_complete):
             if (name := _name_of(message)) is None:
                 sent = channel.send(message)
             else:

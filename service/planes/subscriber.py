@@ -39,8 +39,13 @@ class Subscriber:
         self._pointers: tuple[Any, ...] = ()
         self._deleted = frozenset[Key]()
 
-    def changes(self, snapshot: Snapshot, numbers: PayloadNumbers, publication: int) -> Iterator[Any]:
-        """Return the messages that it lacks, and count them as sent. publication: number of this publication."""
+    def changes(
+        self, snapshot: Snapshot, numbers: PayloadNumbers, publication: int, is_complete: bool
+    ) -> Iterator[Any]:
+        """Return the messages that it lacks, and count them as sent.
+
+        publication: number of this publication; is_complete: as it was before the snapshot.
+        """
         for key, served in snapshot.served.items():
             if key not in self._revisions:
                 yield _new_version(key, served)
@@ -54,7 +59,7 @@ class Subscriber:
             self._streamed[key] = self._served[key], publication
         self._served = dict(snapshot.served)
         deleted = (snapshot.deleted | self._missing) - self._deleted
-        kept = self._unreadable.union(snapshot.served) if self.is_complete else None
+        kept = self._unreadable.union(snapshot.served) if is_complete else None
         pointers = snapshot.serving, snapshot.aliases, kept
         if deleted or pointers != self._pointers:
             yield Pointers(dict(snapshot.serving), dict(snapshot.aliases), deleted, kept)

@@ -23,10 +23,15 @@ class OpenCounter:
     def __init__(self, gauge: Gauge | None = None) -> None:
         self._gauge = new_gauge() if gauge is None else gauge
 
+    @property
+    def open(self) -> int:
+        """The number of open things, of all processes that share it."""
+        return self._gauge.total
+
     @contextmanager
     def count_one(self, most: int) -> Iterator[None]:
         """Count one for the duration of the block; raise BusyError beyond `most`."""
-        already = self._gauge.total
+        already = self.open
         if already >= most:
             raise BusyError(self.too_many.format(already), headers=self.headers)
         self._gauge.add(1)

@@ -16,7 +16,7 @@ from service.api.access.keys import CHALLENGE, Key, Keyring, invalid_key
 from service.api.access.scopes import ADMIN, WEBSOCKET, Rules, scopes_of_stream
 from service.api.errors import refuse
 from service.api.limits.requests import COUNTED
-from service.api.server.connections import CONNECTION, StreamProtocol
+from service.api.server.streams import CONNECTION, StreamProtocol
 from service.foundation.errors import ForbiddenError, NotFoundError, ServiceError, problem, readable
 from service.foundation.settings import is_loopback
 from service.telemetry.logs import KEY_ID

@@ -7,7 +7,8 @@ from typing import Any
 import uvicorn
 
 from service.api.server import sockets
-from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
+from service.api.server.connections import guarded
+from service.api.server.streams import MAX_FRAME_BYTES, StreamProtocol
 from service.foundation.settings import Settings
 
 

@@ -12,7 +12,7 @@ from starlette.types import Message, Receive, Send
 
 from service.api.access.middleware import subprotocol_of
 from service.api.limits.requests import PATIENCE
-from service.api.server.connections import StreamProtocol
+from service.api.server.streams import StreamProtocol
 from service.foundation.settings import Settings
 
 

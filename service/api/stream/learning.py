@@ -25,6 +25,8 @@ from service.models.served import AnsweringModels, ServedModel
 from service.storage.errors import translate_error
 
 logger = logging.getLogger(__name__)
+MAX_WAITING_BLOCKS = 40
+"""Max blocks of frames that wait to be logged: those of four seconds at 1 kHz. Then the stream is not read."""
 
 
 class LearningFrame(NamedTuple):
@@ -88,7 +90,7 @@ class FrameLearning:
         if sequence <= self._sequence:
             expected = f"more than {self._sequence}, that of the last frame to learn from: count up, or reconnect"
             raise invalid_request("sequence", sequence, expected)
-        while len(self._waiting) >= 10 * self._block_rows:  # meanwhile the stream is not read
+        while len(self._waiting) >= MAX_WAITING_BLOCKS * self._block_rows:  # meanwhile the stream is not read
             self._flushed.clear()
             await self._flushed.wait()
 

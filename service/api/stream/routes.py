@@ -12,7 +12,7 @@ from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
 from service.api.access.scopes import ADMIN, PREDICT, Rule
-from service.api.server.connections import CONNECTION, StreamProtocol
+from service.api.server.streams import CONNECTION, StreamProtocol
 from service.api.stream.conversation import Conversation, Echo
 from service.api.stream.learning import StreamLearners
 from service.api.stream.session import Session

@@ -18,7 +18,7 @@ from lipcore.model import dynamics
 from lipcore.model.external import external
 from lipcore.vocabulary import offered_components
 from service.api.errors import UNEXPECTED_ERROR
-from service.api.server.connections import StreamProtocol
+from service.api.server.streams import StreamProtocol
 from service.api.stream.conversation import Conversation
 from service.api.stream.learning import FrameLearning, LearningFrame, StreamLearners
 from service.api.stream.parts import answer_part

@@ -13,8 +13,9 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
 from service.api.server import HOLDS_FOR
-from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.api.server.connections import GuardedProtocol
 from service.api.server.sockets import Server
+from service.api.server.streams import StreamProtocol
 from service.planes.control import ControlServer
 from service.planes.data import DataServer
 from service.planes.pulse import Pulse

@@ -2,6 +2,7 @@
 
 import json
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
@@ -159,7 +160,8 @@ def test_invalid_arguments_are_explained_in_one_line(lipserve, tmp_path, monkeyp
 def test_status_shows_parts_and_missing_extras(run_command, server):
     text, document = run_command("status"), run_command("status", "--json")
     assert f"{server.url} is ready: LIPServe {__version__}" in text
-    assert [each["name"] for each in document["checks"]] == ["database", "home", "models", "learner", "training"]
+    parts = ["database", "home", "models", "learner", "training", *(["planes"] if sys.platform == "linux" else [])]
+    assert [each["name"] for each in document["checks"]] == parts
     assert all(f"{each['name']} " in text and each["message"] in text for each in document["checks"])
     assert document["can"] == server.client.get("/health").json()["can"]
     assert text.count("not installed: pip install") == len(document["missing"])

@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -76,6 +77,17 @@ async def test_silent_control_plane_is_reported_with_what_to_do(monkeypatch):
     with pytest.raises(NotReadyError, match=r"unknown whether these frames are stored.*send them again"):
         await channel.log()
     channel.learners.receive(FramesLogged(channel.sent[0].number, RESULT))  # too late: ignored
+
+
+async def test_further_frames_wait_less_until_the_control_plane_answers(monkeypatch):
+    for name, value in {"MAX_WAIT_S": 0.05, "RESEND_S": 60.0, "monotonic": lambda: 0.0}.items():
+        monkeypatch.setattr(frames, name, value)
+    channel = Channel("gone", "gone", "gone", RESULT, RESULT)
+    for _ in range(5):
+        with suppress(NotReadyError):
+            await channel.log()
+    further = frames.MAX_FURTHER_WAIT_S
+    assert [message.until for message in channel.sent] == [0.05, further, further, further, 0.05]
 
 
 class Log:

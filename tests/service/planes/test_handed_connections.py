@@ -10,7 +10,8 @@ import pytest
 from websockets.sync.client import connect
 
 from service.api.limits.requests import COUNTED, ClientPatience
-from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.api.server.connections import GuardedProtocol
+from service.api.server.streams import StreamProtocol
 from tests.service.api.limits.serving import RawConnection, Serving
 from tests.service.data import DEADLINE, eventually
 from tests.service.planes.requests import ECHO, HOST, PAGE, Digest, echo

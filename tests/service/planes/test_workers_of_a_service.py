@@ -87,14 +87,15 @@ def test_worker_of_a_client_that_disconnects_is_killed(service):
         client.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
         client.shutdown(socket.SHUT_WR)
     eventually(lambda: not all(is_running(pid) for pid in stopped))
+    eventually(lambda: 'status="499"' in service.client.get("/metrics").text)
     for pid in filter(is_running, stopped):
         os.kill(pid, signal.SIGCONT)
     predict(service)
 
 
 def test_long_queries_are_answered_without_a_nursery(service, expected):
-    for each in ("lip-nursery", "lip-worker"):
-        for pid in service.named(each):
-            os.kill(pid, signal.SIGKILL)
-    eventually(lambda: not service.named("lip-worker") and not service.named("lip-nursery"))
+    killed = service.named("lip-nursery") + service.named("lip-worker")
+    for pid in killed:
+        os.kill(pid, signal.SIGKILL)
+    eventually(lambda: not any(is_running(pid) for pid in killed))
     np.testing.assert_allclose(predict(service)["covariance"], expected.covariance, rtol=1e-9, atol=1e-12)

@@ -160,7 +160,8 @@ async def test_incomplete_block_is_logged_after_a_while():
     assert np.concatenate(client.learners.sequences).tolist() == [1, 2, 3, 4]
 
 
-async def test_blocks_are_logged_in_order_and_a_full_backlog_stops_reading():
+async def test_blocks_are_logged_in_order_and_a_full_backlog_stops_reading(monkeypatch):
+    monkeypatch.setattr("service.api.stream.learning.MAX_WAITING_BLOCKS", 10)
     async with SessionClient(stream_flush_rows=2, stream_flush_s=NEVER) as client:
         client.learners.open.clear()
         answered = await client.send_torques(*range(22))
