@@ -139,9 +139,7 @@ def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_t
     arms = 1 + sum(joint.get("root", False) for joint in geometry.get("joints", ()))
     options, name = FitOptions(**request.options.model_dump()), f"{base.model}:{base.version}"
     try:
-        check_base(
-            name, of_base, geometry.get("order"), of_data, request.estimator, options, request.robot, arms
-        )
+        check_base(name, of_base, geometry.get("order"), of_data, request.estimator, options, request.robot, arms)
     except BaseMismatchError as error:
         raise invalid_request(error.field, error.value, error.expected) from None
 
