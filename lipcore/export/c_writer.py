@@ -134,6 +134,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
         **_rest(NonlinearTerm.of(posterior), shared),
         **_correction(posterior, shared),
         "misfit": _braced(misfit),
+        "arm": _integers(posterior.misfit.arms[order]),
         "floor": _braced(posterior.floor),
         "range": _braced(np.array(limits)),
         "payload": "{" + f"{PAYLOAD.mass!r}, {_braced(PAYLOAD.com)}, {_braced(body.reshape(-1))}" + "}",

@@ -90,6 +90,13 @@ class Arm:
         return self.geometry.n_joints
 
     @property
+    def arm_of_joints(self) -> NDArray[np.int64]:
+        """Index of the arm of each joint, (n,), in the order of the data's joints."""
+        out = np.empty_like(self.order)
+        out[self.order] = self.geometry.arm_of
+        return out
+
+    @property
     def geometries(self) -> tuple[Geometry, ...]:
         """The arm's geometry, then those of the alternatives."""
         return (self.geometry, *(each.geometry for each in self.alternatives[1:]))

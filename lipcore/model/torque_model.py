@@ -392,7 +392,7 @@ class TorqueModel:
             posterior.root,
             posterior.std_factor,
             posterior.floor,
-            posterior.misfit.packed(),
+            posterior.misfit,
             None if torque is None else (np.array(torque["mean"]), np.square(torque["std"])),
             np.abs([self.training_range["dq"][end] for end in ("min", "max")]).max(0) < SIGN_WIDTH,
         )

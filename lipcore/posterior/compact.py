@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.motion import Array, Indices, Motion
+from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arrays import on_last_diagonal
 from lipcore.kernels.base import LinearKernel, Params, TorqueKernel
 from lipcore.posterior.basis import Basis
@@ -127,6 +128,9 @@ class CompactPosterior(Posterior):
         root = solve_lower_right(solution.root, basis.root)
         floor = np.zeros_like(noise_variance) if floor is None else floor
         misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
+        for term in basis.linear:
+            if isinstance(term, ArmKernel):
+                misfit = replace(misfit, arms=term.arm.arm_of_joints)
         return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor, misfit)
 
     def corrected(self, kernel: TorqueKernel, noise_variance: Array, a: Array) -> CompactPosterior:

@@ -60,8 +60,8 @@ class Evaluator:
 
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), the chosen torques, as sample · n + joint. linear: the linear terms in the order
-    of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,) (N·m)²;
-    misfit: see `Misfit.packed`; None for no floor or misfit. usual: mean and variance of the torque in
+    of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,) (N·m)².
+    floor, misfit: None for none. usual: mean and variance of the torque in
     training, (n,) each, if predictions may fall back; stood: joints that stood still there, (n,).
 
     Without a nonlinear term, torques and standard deviations are computed joint by joint, each from the weights that it
@@ -87,7 +87,7 @@ class Evaluator:
         root: Array,
         std_factor: float = 1.0,
         floor: Array | None = None,
-        misfit: Array | None = None,
+        misfit: Misfit | None = None,
         usual: tuple[Array, Array] | None = None,
         stood: NDArray[np.bool_] | None = None,
     ) -> None:
@@ -127,7 +127,8 @@ class Evaluator:
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
-        self._misfit = Misfit.none(n).packed() if misfit is None else np.array(misfit, np.float64)
+        misfit = Misfit.none(n) if misfit is None else misfit
+        self._misfit, self._arms = misfit.packed(), misfit.arms
         rows = MISFIT_ROWS, MISFIT_ROWS + 2 * len(ELEMENTS)
         if self._misfit.shape not in [(count, n) for count in rows]:
             raise ValueError(f"misfit has shape {self._misfit.shape}, expected ({rows[0]} or {rows[1]}, {n})")
@@ -324,6 +325,7 @@ class Evaluator:
             self._std_factor,
             self._floor,
             self._misfit,
+            self._arms,
             SIGN_WIDTH,
             self._usual,
             motions,

@@ -10,7 +10,7 @@ from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.independence import INDEPENDENT_HZ, recording_weights
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Indices, Motion
 from lipcore.data.repetition import measure_distinct_share
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
@@ -58,8 +58,8 @@ class Misfit:
         at rest      rest_j exp(−(dq_j / slow_j)²) + still_j exp(−(dq_j / w)²) + (Σ_k |f_jk| d_jk)²
         faster       lasting_j (max(0, mean_i (dq_i / speed_i)² − 1) + ACCELERATED max(0, mean_i (ddq_i / u_i)² − 1))
 
-    u is `acceleration`, w is SIGN_WIDTH. The variance of faster motion depends on all joints i. d is the standard
-    deviation of an element's deflection, f its torque.
+    u is `acceleration`, w is SIGN_WIDTH. The variance of faster motion depends on all joints i of the same arm. d is
+    the standard deviation of an element's deflection, f its torque.
     """
 
     rest: Array
@@ -77,6 +77,12 @@ class Misfit:
     """Variance of friction of joints that stand still, beyond `rest`, (n,) (N·m)²."""
     elements: Array = field(default_factory=lambda: np.zeros((2, 0, 1)))
     """Torque |w| of the drive's play elements as trained, and their widths, (2, K, n)."""
+    arms: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Index of each joint's arm, (n,); all zero if not given. It is not part of `packed`: the geometry has it."""
+
+    def __post_init__(self) -> None:
+        if not len(self.arms):
+            object.__setattr__(self, "arms", np.zeros(len(self.rest), np.int64))
 
     @classmethod
     def none(cls, n: int) -> Misfit:
@@ -100,7 +106,7 @@ class Misfit:
 
     def of_joints(self, joints: NDArray[np.int64]) -> Misfit:
         """Return this misfit with the joints in another order. joints: (n,), their places in this misfit."""
-        return Misfit.unpacked(self.packed()[:, joints])
+        return replace(Misfit.unpacked(self.packed()[:, joints]), arms=self.arms[joints])
 
     def with_friction(self, coulomb: Array) -> Misfit:
         """Return this misfit for joints that stand still, with at least `rest_share` × `coulomb`² there, (n,) N·m.
@@ -139,11 +145,20 @@ class Misfit:
         usual, lasting = (self.speed, self.acceleration), constant(self.lasting, motion.dq)
         xp = array_namespace(motion.dq)
         speed, acceleration = (
-            xp.clip(((each / constant(most, each)) ** 2).mean(-1) - 1, 0.0, None)[:, None]
+            xp.clip(self._of_arms((each / constant(most, each)) ** 2) - 1, 0.0, None)
             for each, most in zip((motion.dq, motion.ddq), usual, strict=True)
         )
         total: Array = self.at_rest(motion) + lasting * (speed + ACCELERATED * acceleration)
         return total
+
+    def _of_arms(self, squares: Array) -> Array:
+        """Return the mean over the joints of each joint's arm, (N, n) or (N, 1). squares: (N, n)."""
+        if not self.arms.any():
+            mean: Array = squares.mean(-1)[:, None]
+            return mean
+        same = self.arms[:, None] == self.arms
+        out: Array = (squares[:, None] * constant(same / same.sum(axis=1), squares)).sum(-1)
+        return out
 
     def of_row(self, noise: Array, motion: Motion, rows: float = INDEPENDENT_HZ * OPTIONS.lasting_s) -> Array:
         """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)².

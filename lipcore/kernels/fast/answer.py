@@ -119,6 +119,7 @@ def answer(
     std_factor: float,
     floor: Array,
     misfit: Array,
+    arms: Indices,
     sign_width: float,
     usual: Array,
     motions: Array,
@@ -144,6 +145,7 @@ def answer(
     - misfit: (6 + 2 K, n), see `Misfit.packed`: variance at rest, the speed at which it has decayed to exp(−1),
       variance of faster motion, the usual speed and acceleration, variance at standstill, torque and widths of the play
       elements;
+    - arms: (n,), index of each joint's arm, whose motion may be faster;
     - sign_width: speed at which the variance at standstill has decayed to exp(−1);
     - usual: (n,), training variance of the torque, infinite if unknown;
     - motions: (N, …, n), of which dq, ddq and the deflections are read;
@@ -182,12 +184,10 @@ def answer(
         _variances(fixed, places, counts, features, memory, covariance)
     for query in range(queries):
         _scale(std_factor * std_factor, full, covariance[query])
-        speed, acceleration = 0.0, 0.0
+        faster = 0.0
         for j in range(n):
-            speed += (motions[query, 1, j] / misfit[3, j]) ** 2
-            acceleration += (motions[query, 2, j] / misfit[4, j]) ** 2
-        faster = max(speed / n - 1.0, 0.0) + ACCELERATED * max(acceleration / n - 1.0, 0.0)
-        for j in range(n):
+            if j == 0 or arms[j] != arms[j - 1]:
+                faster = _faster(misfit, motions[query], arms, arms[j])
             share[query, j] = fallback_share(covariance[query, j, j], usual[j])
             any_share |= share[query, j] > 0.0
             more = misfit[0, j] * np.exp(-((motions[query, 1, j] / misfit[1, j]) ** 2)) + misfit[2, j] * faster
@@ -196,6 +196,18 @@ def answer(
             covariance[query, j, j] = max(covariance[query, j, j] + more, floor[j])
             std[query, j] = np.sqrt(covariance[query, j, j])
     return any_share
+
+
+@inlined
+def _faster(misfit: Array, motion: Array, arms: Indices, arm: int) -> float:
+    """Return by how much an arm's motion exceeds that of the training, see `Misfit`."""
+    speed, acceleration, joints = 0.0, 0.0, 0
+    for j in range(misfit.shape[1]):
+        if arms[j] == arm:
+            speed += (motion[1, j] / misfit[3, j]) ** 2
+            acceleration += (motion[2, j] / misfit[4, j]) ** 2
+            joints += 1
+    return max(speed / joints - 1.0, 0.0) + ACCELERATED * max(acceleration / joints - 1.0, 0.0)
 
 
 @inlined
@@ -264,6 +276,7 @@ def answer_one(
     std_factor: float,
     floor: Array,
     misfit: Array,
+    arms: Indices,
     sign_width: float,
     usual: Array,
     motions: Array,
@@ -286,6 +299,7 @@ def answer_one(
         std_factor,
         floor,
         misfit,
+        arms,
         sign_width,
         usual,
         motions,

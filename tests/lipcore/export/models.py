@@ -74,7 +74,8 @@ def with_misfit(model: TorqueModel) -> TorqueModel:
     """Return the model with every contribution to the variance."""
     rng, n = np.random.default_rng(0), model.n_joints
     rows = np.stack([rng.uniform(0.1, 1.0, n), np.full(n, 0.1), *rng.uniform(0.5, 1.0, (4, n))])
-    misfit = Misfit.unpacked(rows)
+    own = model.posterior.misfit
+    misfit = replace(Misfit.unpacked(rows), elements=own.elements, arms=own.arms)
     floor = np.array([1e-4, 10.0, *[1e-4] * (n - 2)])
     return replace(model, posterior=replace(model.posterior, misfit=misfit, floor=floor, std_factor=1.3))
 
@@ -117,7 +118,7 @@ def train_with_alternatives_and_drive() -> TorqueModel:
 MODELS = {
     "panda": lambda: load(PANDA),
     "prismatic": lambda: train_arm("RPR", 51),
-    "two arms": lambda: with_drive(train_arm("RRpRR", 52), *DRIVE_KINDS),
+    "two arms": lambda: with_misfit(with_drive(train_arm("RRpRR", 52), *DRIVE_KINDS)),
     "prismatic first": lambda: train_arm("PRR", 50),
     "alternatives": train_with_alternatives,
     "fixed, from its tip": lambda: reversed_pendulum_model("fixed", OPTIONS),
