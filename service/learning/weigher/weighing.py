@@ -177,6 +177,7 @@ class Weighing:
             monitor.number = event.number
             monitor.streams.change(stream_id, scale=None)  # errors during the change do not calibrate its intervals
             served.scales.replace(monitor.streams.factors(served.version))
+        self.loaded.wake(model)  # the next batch may be hours away
 
 
 def _describe_watch(stream_id: str, watch: PayloadTracker) -> tuple[str, dict[str, object]]:

@@ -44,6 +44,15 @@ def read_stream_gauges(server, model):
 
 
 @pytest.mark.slow
+def test_answers_forget_rows_of_a_detected_payload_without_a_further_batch(server, payload_model):
+    def read_status():
+        return server.client.get(f"/v1/models/{payload_model}/learning").json()["status"]
+
+    eventually(lambda: read_status()["events"] > len(payload_batches(STREAM_ID)))  # the payload is logged
+    eventually(lambda: read_status()["lag_events"] == 0, 60.0)
+
+
+@pytest.mark.slow
 def test_payload_is_the_same_on_all_interfaces(server, client, payload_model):
     def read_views():
         """Return all views once two reads agree; a refinement between reads changes them."""
