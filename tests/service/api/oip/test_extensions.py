@@ -31,7 +31,7 @@ def test_index_names_versions_that_cannot_be_read(api, trained, monkeypatch):
     loaded = service_of(api).loaded
     monkeypatch.setattr(Files, "load_version", broken)
     monkeypatch.setattr(loaded, "_snapshot", type(loaded._snapshot)())
-    monkeypatch.setattr(loaded, "_unreadable", {})
+    monkeypatch.setattr(loaded._loader, "_unreadable", {})
     error_message(api.get(f"/v2/models/{trained.name}/ready"), 503)
     state, reason = index(api)[trained.name, "1"]
     assert (state, "the manifest is missing" in reason) == ("UNAVAILABLE", True)
