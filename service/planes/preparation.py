@@ -8,9 +8,10 @@ from importlib import import_module
 
 import numpy as np
 
+import lipcore
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import ServiceError
-from service.foundation.settings import Settings
+from service.foundation.settings import Settings, shipped_models
 from service.models import registry
 from service.models.loading import PRELOADED
 from service.storage.database import Database
@@ -38,6 +39,8 @@ def share_memory(settings: Settings) -> None:
     files = Files.of(settings)
     if not files.shared:
         _load_models(settings, files)
+    if not PRELOADED:  # a new home: compiled code that a model of any kind needs
+        warm_up(lipcore.load(shipped_models() / "panda-sim"))
     gc.collect()
     gc.freeze()
 
@@ -48,7 +51,7 @@ def warm_up(model: TorqueModel) -> None:
 
     model.warm_up()
     model.answer(np.zeros((3, model.n_joints)))
-    if model.arm is not None:
+    if model.arms == 1:
         Carrier(model).warm_up()
 
 
