@@ -10,13 +10,13 @@ import grpc
 
 from service.api.oip.rpc.listening import CLIENT, COUNTED_CALL, ERROR_CODE
 
-MAX_RECONNECT_MS = 250
-"""Max pause between two tries to connect, while the other process starts again."""
+MAX_RECONNECT_MS, MAX_CONNECT_MS = 250, 5000
+"""Max pause between two tries to connect, while the other process starts again, and max time of a try."""
 _OPTIONS = (
     ("grpc.max_receive_message_length", -1),
     ("grpc.max_send_message_length", -1),
     ("grpc.initial_reconnect_backoff_ms", 50),
-    ("grpc.min_reconnect_backoff_ms", 50),
+    ("grpc.min_reconnect_backoff_ms", MAX_CONNECT_MS),  # gRPC's name for the max time of a try
     ("grpc.max_reconnect_backoff_ms", MAX_RECONNECT_MS),
     ("grpc.enable_http_proxy", 0),
 )
