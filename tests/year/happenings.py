@@ -19,7 +19,7 @@ from service.storage.backup import backup, restore
 from tests.service.data import ended, eventually
 from tests.year.laboratory import QUOTA_BYTES, Laboratory
 from tests.year.ledger import DAY_S
-from tests.year.robots import Robot, recording
+from tests.year.robots import VISCOUS, Robot, recording
 
 CLOCK_STEPS_S = (-DAY_S / 2, -3600.0, -5.0, 5.0, 3600.0, DAY_S / 2)
 """Errors of the host's clock, s."""
@@ -195,7 +195,8 @@ def carry_payload(lab: Laboratory) -> None:
 
 def drift_friction(lab: Laboratory) -> None:
     """Change the friction of a robot for good."""
-    lab.random.choice(lab.robots).friction += lab.random.choice((0.1, 0.3, -0.05))
+    robot = lab.random.choice(lab.robots)
+    robot.friction = max(robot.friction + lab.random.choice((0.1, 0.3, -0.05)), -VISCOUS)
 
 
 def set_options(lab: Laboratory) -> None:

@@ -124,7 +124,7 @@ class Laboratory:
 
     def train(self, robot: Robot) -> dict[str, Any]:
         """Upload a recording of a robot's arm, and train a version that serves; return the job."""
-        samples = stream(robot.arm, 200, seed=self.random.randrange(10), viscous=VISCOUS + robot.friction)
+        samples = stream(robot.arm, 200, seed=self.random.randrange(10), viscous=max(VISCOUS + robot.friction, 0.0))
         dataset = upload(self.client, samples)["id"]
         self.datasets.setdefault(robot.model, []).append(dataset)
         request = {
