@@ -80,7 +80,7 @@ def test_live_events_end_when_the_model_is_deleted(learning_model):
 
 
 def test_too_many_readers_are_rejected(learning_service, learning_model, monkeypatch):
-    monkeypatch.setattr(learning_service.service.learners.live, "open", MAX_FOLLOWERS)
+    monkeypatch.setattr(type(learning_service.service.learners.live), "open", MAX_FOLLOWERS)
     answer = learning_model.client.get(learning_model.url("live"))
     error(answer, 429, "busy")
     assert int(answer.headers["retry-after"]) > 0

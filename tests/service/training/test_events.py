@@ -52,7 +52,7 @@ def waiting(no_worker):
 
 
 def test_number_of_readers_is_limited(no_worker, waiting, monkeypatch):
-    monkeypatch.setattr(service_of(no_worker).jobs.feed, "open", MAX_FOLLOWERS)
+    monkeypatch.setattr(type(service_of(no_worker).jobs.feed), "open", MAX_FOLLOWERS)
     answer = no_worker.get(waiting)
     error(answer, 429, "busy")
     assert int(answer.headers["retry-after"]) > 0
