@@ -16,10 +16,8 @@ from tests.service.api.oip.grpc import Code, GrpcService, request, start_service
 from tests.service.data import DEADLINE, eventually
 from tests.service.planes.test_sums import BATCH, LIVE, MODEL, MOTION, READY, kill, process_of, samples
 
-pytestmark = [
-    pytest.mark.slow,  # needs Triton's client
-    pytest.mark.skipif(sys.platform != "linux", reason="two planes need Linux"),
-]
+# slow: needs Triton's client
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="planes need Linux")]
 SETTINGS = {"LIPSERVE_DATA_PLANE": "on", "LIPSERVE_LOG_FORMAT": "json"}
 
 

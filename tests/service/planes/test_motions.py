@@ -15,10 +15,7 @@ from tests.service.models.archives.packing import exported, imported
 from tests.service.planes.test_sums import LIVE, ids, is_from, two_planes
 
 __all__ = ["model"]  # a fixture
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(sys.platform != "linux", reason="two planes need Linux"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="planes need Linux")]
 PARTS = (slice(0, 1), slice(1, 4), slice(4, 5), slice(5, 6), slice(6, 20), slice(20, 21))
 
 

@@ -239,7 +239,8 @@ def test_connections_per_address_are_limited(serving_kind):
     with serving_kind(**limits, trusted_proxies="127.0.0.0/8") as serving, ExitStack() as stack:
         for _ in range(4):
             assert stack.enter_context(RawConnection(serving.port)).ask(GET) == HELLO
-        assert serving.connections == 4
+        # one that is on its way to the other plane counts twice for a moment
+        assert eventually(lambda: serving.connections == 4)
 
 
 def test_streams_count_as_connections_of_their_address(serving_kind):
