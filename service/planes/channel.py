@@ -15,11 +15,10 @@ from array import array
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from service.planes.pages import map_file
+from service.planes.pages import map_file, write_buffers
 
 logger = logging.getLogger(__name__)
 
@@ -54,17 +53,14 @@ class Package:
         size = len(data) + sum(each.nbytes for each in views)
         if size < MIN_SHARED_BYTES:
             return cls([], pickle.dumps(message, 5) if views else data, None)
-        parts = [memoryview(data), *views]
-        ends = [0, *accumulate(-(-each.nbytes // 64) * 64 for each in parts)]  # aligned like NumPy's own arrays
         file = os.memfd_create("lipserve", os.MFD_CLOEXEC)
         try:
-            os.ftruncate(file, ends[-1])
-            for part, at in zip(parts, ends, strict=False):
-                _write(file, part, at)
+            places = write_buffers(file, [data, *views])
+            os.ftruncate(file, sum(places[-1]))  # an empty last array begins beyond the end
         except BaseException:
             os.close(file)
             raise
-        return cls([(at, each.nbytes) for at, each in zip(ends, parts, strict=False)], b"", file)
+        return cls(places, b"", file)
 
     @property
     def size(self) -> int:
@@ -167,9 +163,3 @@ def _read(data: bytes, fds: list[int]) -> Any:
         os.close(file)
     message, *buffers = (content[at : at + length] for at, length in places)
     return pickle.loads(message, buffers=buffers)  # noqa: S301 - as above
-
-
-def _write(file: int, part: memoryview, at: int) -> None:
-    done = 0
-    while done < part.nbytes:
-        done += os.pwrite(file, part[done:], at + done)

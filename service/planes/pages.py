@@ -1,10 +1,11 @@
-"""Files in memory, mapped without a file descriptor: a process may map thousands."""
+"""Files in memory: how they are written, and mapped without a file descriptor. A process may map thousands."""
 
 from __future__ import annotations
 
 import ctypes
 import mmap
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,21 @@ _libc.mmap.restype = ctypes.c_void_p
 _libc.mmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_long]
 _libc.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
 _FAILED = ctypes.c_void_p(-1).value
+Buffer = bytes | memoryview
+ALIGNMENT = 64
+"""Bytes of which the start of each buffer is a multiple, as of NumPy's own arrays."""
+
+
+def write_buffers(file: int, buffers: Sequence[Buffer]) -> list[tuple[int, int]]:
+    """Write buffers one after another; return the start and size of each. Writing needs no interpreter lock."""
+    spans, at = list[tuple[int, int]](), 0
+    for each in buffers:
+        data, done = memoryview(each), 0
+        while done < data.nbytes:
+            done += os.pwrite(file, data[done:], at + done)
+        spans.append((at, data.nbytes))
+        at += -(-data.nbytes // ALIGNMENT) * ALIGNMENT
+    return spans
 
 
 class _Pages:
@@ -30,8 +46,8 @@ class _Pages:
 def map_file(file: int, size: int) -> memoryview:
     """Return the first `size` bytes of a file, at least one. Raise OSError or ValueError.
 
-    `mmap.mmap` would keep a descriptor as long as an array refers to the file. The pages are private and writable, as
-    those of other arrays are; they stay shared because nobody writes.
+    `mmap.mmap` would keep a descriptor as long as an array refers to the file. The pages are private and writable, like
+    those of other arrays. They stay shared, because nobody writes to them.
     """
     if not 0 < size <= os.fstat(file).st_size:  # reading beyond the end would kill the process
         raise ValueError(f"the file has {os.fstat(file).st_size} bytes, expected {size}")

@@ -9,9 +9,7 @@ import mmap
 import os
 from collections.abc import Sequence
 
-Buffer = bytes | memoryview
-ALIGNMENT = 64
-"""Bytes of which the start of each buffer is a multiple."""
+from service.planes.pages import Buffer, write_buffers
 
 
 class Arena:
@@ -26,14 +24,7 @@ class Arena:
 
     def write(self, buffers: Sequence[Buffer]) -> list[tuple[int, int]]:
         """Replace the content and return the start and size of each buffer, without the interpreter's lock."""
-        spans, at = [], 0
-        for each in buffers:
-            data, done = memoryview(each), 0
-            while done < data.nbytes:
-                done += os.pwrite(self.handle, data[done:], at + done)
-            spans.append((at, data.nbytes))
-            at += -(-data.nbytes // ALIGNMENT) * ALIGNMENT
-        return spans
+        return write_buffers(self.handle, buffers)
 
     def read(self, spans: Sequence[tuple[int, int]]) -> list[bytes]:
         """Return copies of the buffers, without the interpreter's lock."""
