@@ -1,5 +1,6 @@
 """The database: tables, sessions, and migrations from earlier releases."""
 
+from service.storage.database.dates import iso_time, now
 from service.storage.database.engine import Database, fetch
 from service.storage.database.tables import (
     AlarmEventRow,
@@ -23,8 +24,6 @@ from service.storage.database.tables import (
     SnapshotRow,
     StreamRow,
     VersionRow,
-    iso_time,
-    now,
 )
 
 __all__ = [

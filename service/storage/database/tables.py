@@ -2,26 +2,10 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import JSON, BigInteger, ForeignKey, Index, Integer, LargeBinary, String, UniqueConstraint
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
-
-
-def now() -> str:
-    """Return the current time, ISO 8601 in UTC."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-MOMENT_RANGE = (-62135596800.0, 253402300799.0)
-"""First and last second that a date has, the years 1 to 9999, Unix time, s."""
-
-
-def iso_time(seconds: float) -> str:
-    """Return Unix seconds as an ISO time, the nearest that exists."""
-    within = min(max(seconds, MOMENT_RANGE[0]), MOMENT_RANGE[1])
-    return datetime.fromtimestamp(within, UTC).isoformat(timespec="milliseconds")
 
 
 class Base(DeclarativeBase):
