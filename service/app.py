@@ -231,7 +231,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
 
 
 def _chores(storage: Storage, learners: Learners) -> dict[str, Callable[[], object]]:
-    """Return the functions that delete what is too old, by what they delete."""
+    """Return the hourly chores, by the name of what they delete."""
     cleaners = {
         "lines of the audit log": audit_log.clean,
         "alarms": alarms.clean,

@@ -55,7 +55,7 @@ def check_same(stored: OnlineModel, recomputed: OnlineModel) -> None:
     for name, values in one.items():
         scale = MAX_DIFFERENCE * np.abs(values[np.isfinite(values)]).max(initial=1.0)
         if values.shape != other[name].shape or not np.allclose(values, other[name], 0.0, scale, equal_nan=True):
-            raise ValueError(f"`{name}` of the state differs from what the log gives")
+            raise ValueError(f"`{name}` of the state differs from the value recomputed from the log")
 
 
 def find_gap(session: Session, model: str) -> tuple[int, int] | None:

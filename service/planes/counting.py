@@ -7,7 +7,7 @@ on since.
 from __future__ import annotations
 
 import asyncio
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -127,7 +127,7 @@ class AdoptedConnections:
 
     def report_now(self) -> None:
         """Report what has changed since the last report."""
-        made = ConnectionReport(self.through, dict(Counter(self._limit.count_by_peer(self._present))))
+        made = ConnectionReport(self.through, dict(self._limit.count_by_peer(self._present)))
         if made != self.sent:
             self.sent = made
             self._send(made)

@@ -85,7 +85,7 @@ def run(inherited: Inheritance, part: int) -> None:
 
 
 def _log(granted: RealTime) -> None:
-    """Log what the system grants, and how it would grant more."""
+    """Log the granted scheduling policy and locked pages, and what to do about each refusal."""
     pages = "locked" if granted.pages_locked else "not locked"
     policy = f"{granted.policy} {granted.priority}" if granted.priority else granted.policy
     logger.info("control loops are answered by a thread of the scheduling policy %s; its pages are %s", policy, pages)

@@ -66,7 +66,7 @@ class Publisher:
     def publish(self) -> int:
         """Send every data plane what it lacks; return the number of changes that they now know."""
         with self._lock:
-            number = self._loaded.changes.number  # before what it counts: a later change is published again
+            number = self._loaded.changes.number  # read first: what changes from here on is published again
             with ExitStack() as closing:
                 packages = dict[Any, Package]()
                 for subscriber in tuple(self._subscribers.values()):

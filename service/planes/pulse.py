@@ -19,7 +19,7 @@ BEAT_S = 0.05
 """Seconds between two beats of an event loop."""
 MAX_STARVED_S = 5.0
 """Max silence of a process that the system gives no processor, s."""
-TOLD_S = 600.0
+RESTART_WARNING_S = 600.0
 """Seconds for which readiness mentions a restart."""
 _BEAT, _RESTART = Struct("<QQ"), Struct("<Qd")
 _ROW = _BEAT.size + _RESTART.size
@@ -68,7 +68,7 @@ class Pulse:
         told = []
         for plane in Plane:
             count, ago = self.restarts(plane)
-            if count and ago < TOLD_S:
+            if count and ago < RESTART_WARNING_S:
                 times = "once" if count == 1 else f"{count} times"
                 told.append(f"the {plane.name.lower()} plane was restarted {times}, the last time {ago:.0f} s ago")
         return ("warning", "; ".join(told)) if told else ("ok", "both planes work")

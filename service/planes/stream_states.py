@@ -1,4 +1,4 @@
-"""Width factors and payloads of streams: what changed since a data plane was last told."""
+"""Width factors and payloads of streams: changes since the last publication to a data plane."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PayloadNumbers:
 
 
 class SentStreams:
-    """The streams of one version, as a data plane was told."""
+    """The streams of one version, as they were sent to one data plane."""
 
     def __init__(self, key: Key) -> None:
         self._key = key

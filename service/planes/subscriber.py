@@ -87,7 +87,7 @@ class Subscriber:
         self._unconfirmed = [each for each in self._unconfirmed if each > number]
 
     def complete(self, loaded: Mapping[Key, bool | None]) -> None:
-        """Drop from now on what the control plane drops. loaded: whether it has loaded what the data plane held.
+        """From now on, drop what the control plane drops. loaded: whether it has loaded each version that was held.
 
         None stands for a version that does not exist any more. The data plane keeps one that cannot be read.
         """

@@ -1,4 +1,4 @@
-"""Chores of a running service: each deletes what is too old, once an hour."""
+"""Hourly chores of a running service: each deletes rows or files that are too old."""
 
 from __future__ import annotations
 

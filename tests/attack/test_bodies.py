@@ -192,7 +192,7 @@ def test_bodies_cut_off(attacked, routes):
 
 @pytest.mark.parametrize("framing", FRAMINGS)
 def test_wrong_lengths(attacked, routes, framing):
-    """No byte of a body is taken for a request."""
+    """Bytes of a body are never read as another request."""
     headers, body = FRAMINGS[framing]
     smuggled = b"GET /smuggled HTTP/1.1\r\nhost: localhost\r\n\r\n"
     kind = b"content-type: application/json\r\n"

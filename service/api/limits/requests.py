@@ -62,7 +62,7 @@ def body_limit(limits: Mapping[str, int], path: str) -> int:
 
 
 WITHOUT_BODY = ("GET", "HEAD")
-"""Methods whose request bodies are ignored, because they have no meaning."""
+"""Methods of requests without a body; if there is one, it is ignored."""
 
 
 class BodyLimit:

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from service.planes.pulse import MAX_STARVED_S, TOLD_S, Plane, Pulse, Watch, cpu_s, is_runnable
+from service.planes.pulse import MAX_STARVED_S, RESTART_WARNING_S, Plane, Pulse, Watch, cpu_s, is_runnable
 from tests.service.data import eventually
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -136,5 +136,5 @@ def test_restarts_are_a_warning_for_some_time(pulse, clock):
     pulse.record_restart(Plane.DATA)
     clock.now += 2
     assert pulse.check(None) == ("warning", "the data plane was restarted 2 times, the last time 2 s ago")
-    clock.now += TOLD_S
+    clock.now += RESTART_WARNING_S
     assert pulse.check(None)[0] == "ok"
