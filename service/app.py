@@ -54,6 +54,7 @@ from service.learning.learners import Learners
 from service.learning.metrics import LearningCollector
 from service.models import aliases, deletion, shipped
 from service.models.loaded import LoadedModels
+from service.models.loading import Store
 from service.replication import Replication
 from service.runtime.confinement import protections
 from service.runtime.hourly import run_hourly
@@ -76,10 +77,10 @@ Errors are `{"error": {code, message, detail}}`, below /v2 `{"error": message}` 
 """
 
 
-def create_app(settings: Settings | None = None, shared: Shared | None = None) -> FastAPI:
+def create_app(settings: Settings | None = None, shared: Shared | None = None, store: Store | None = None) -> FastAPI:
     """Return the application. It opens files and the database only when it starts.
 
-    shared: what it shares with other processes of the service; None if it is alone.
+    shared: what it shares with other processes of the service; None if it is alone. store: see `LoadedModels`.
     """
     settings, shared = settings or Settings(), shared or Shared()
     stopping, meters = StopState(), Meters(counters=shared.counters)
@@ -93,7 +94,7 @@ def create_app(settings: Settings | None = None, shared: Shared | None = None) -
         # before a model is loaded: BLAS rounds differently with another number of threads
         threadpool_limits(SERVING_THREADS)
         limit_threads(SERVING_THREADS)
-        storage, jobs, learners = await to_thread.run_sync(_open, settings)
+        storage, jobs, learners = await to_thread.run_sync(_open, settings, store)
         webhook = Webhook(storage.database, settings)
         _share(app, storage, jobs, learners, webhook, shared)
         learners.loaded.when_deleted.append(meters.forget)
@@ -203,7 +204,7 @@ def _add_middleware(
     app.add_middleware(RequestContext, meters=meters, log=log, tracing=settings.opentelemetry)  # the outermost
 
 
-def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
+def _open(settings: Settings, store: Store | None) -> tuple[Storage, JobQueue, Learners]:
     """Open the home, clean up after an earlier run, and preload models."""
     # s after which a computing thread yields to the event loop. Python's 5 ms exceed a control loop's period.
     # With 0.1 ms the loop was over half a millisecond late two to five times as often beside a stream
@@ -213,7 +214,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     database.adapter.settle()
     start_sweeping(database, files)
     shipped.install_shipped(database, files)
-    loaded = LoadedModels(storage, LearntVersions(database, files))
+    loaded = LoadedModels(storage, LearntVersions(database, files), store=store)
     logger.info("loaded %s of %s", counted(loaded.preload(), "model"), settings.home)
 
     def trained(model: str, _: int) -> None:

@@ -15,7 +15,7 @@ from service.contract.states import PartState
 from service.foundation.errors import NotFoundError, UnreadableVersionError
 from service.models import registry
 from service.models.changes import Changes
-from service.models.loading import VersionLoader, freeze_version, warmed
+from service.models.loading import Store, VersionLoader, freeze_version, warmed
 from service.models.registry import SERVING, Serving
 from service.models.scales import Scales
 from service.models.served import Alias, Key, LearntStates, RevisionWaiters, ServedModel
@@ -34,9 +34,13 @@ class LoadedModels:
     Beyond `capacity`, a setting, the least recently used versions are dropped. A version starts to answer once it is in
     memory and warm, by one assignment. Queries in flight keep theirs, and none waits. Revisions and aliases change in
     the same way.
+
+    store: stores the arrays of versions and revisions where other processes can use them; None if no other does.
     """
 
-    def __init__(self, storage: Storage, learnt: LearntStates, capacity: int | None = None) -> None:
+    def __init__(
+        self, storage: Storage, learnt: LearntStates, capacity: int | None = None, store: Store | None = None
+    ) -> None:
         self.storage, self.settings, self.learnt = storage, storage.settings, learnt
         self.database, self.files = storage.database, storage.files
         self.capacity = storage.settings.max_loaded_models if capacity is None else capacity
@@ -49,7 +53,8 @@ class LoadedModels:
         self._revising = threading.Lock()
         self._snapshot = Snapshot(aliases=registry.pointers(storage.database))
         self.changes = Changes()  # of versions, revisions, aliases, width factors and payloads
-        self._loader = VersionLoader(self.database, self.files, learnt, self.changes.note)
+        self._store = store or (lambda value: value)
+        self._loader = VersionLoader(self.database, self.files, learnt, self.changes.note, self._store)
         self._lock = threading.Lock()
         self.moving = threading.Lock()
         """Lock for moves of aliases and deletions of versions. Its holder changes the database, then this object."""
@@ -223,7 +228,7 @@ class LoadedModels:
 
         Ignore it if an equal or higher revision is present. Fast, but it may wait for a lock: use it in a thread.
         """
-        key = (name, version)
+        key, learnt = (name, version), self._store(learnt)
         with self._revising:  # one at a time, so that the highest revision wins
             if key in self._snapshot.deleted:
                 return False

@@ -7,6 +7,7 @@ import logging
 import threading
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
 
+Store = Callable[[Any], Any]
+"""Returns an equal object whose arrays are elsewhere in memory."""
 PRELOADED: dict[str, TorqueModel] = {}
 """Versions that were loaded before this process was forked, by folder."""
 
@@ -33,11 +36,14 @@ class VersionLoader:
     """Reads versions; safe to share between threads.
 
     It keeps the width factors and the payloads of each version that was ever in memory, and why versions cannot be
-    read. changed: called after a change of width factors or payloads.
+    read. changed: called after a change of width factors or payloads. store: see `LoadedModels`.
     """
 
-    def __init__(self, database: Database, files: Files, learnt: LearntStates, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, database: Database, files: Files, learnt: LearntStates, changed: Callable[[], None], store: Store
+    ) -> None:
         self._database, self._files, self._learnt, self._changed = database, files, learnt, changed
+        self._store = store
         self._lock = threading.Lock()
         self._scales: dict[Key, Scales] = {}
         self._payloads: dict[Key, StreamPayloads] = {}
@@ -75,7 +81,7 @@ class VersionLoader:
             return served, False
         if known is None:
             return served, False
-        return replace(served, model=warmed(known.model), revision=known.revision), known.behind
+        return replace(served, model=warmed(self._store(known.model)), revision=known.revision), known.behind
 
     def scales(self, model: str) -> dict[int, Scales]:
         """Return the width factors of a model's versions, of those that were ever in memory."""
@@ -105,7 +111,12 @@ class VersionLoader:
 
     def _read(self, row: VersionRow) -> TorqueModel:
         try:
-            return PRELOADED.get(row.folder) or self._files.load_version(row.folder, row.checksums)
+            if (preloaded := PRELOADED.get(row.folder)) is not None:
+                return preloaded
+            model = self._files.load_version(row.folder, row.checksums)
+            model.warm_up()  # stores what it has built, too
+            stored: TorqueModel = self._store(model)
+            return stored
         except lipcore.ModelFormatError as error:
             registry.find(self._database, row.model, row.version)  # it may have been deleted meanwhile
             message = f"version {row.version} of model {row.model!r} cannot be loaded: {error}"

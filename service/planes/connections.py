@@ -169,7 +169,7 @@ class DataProtocol(GuardedProtocol):
     def _leave(self) -> None:
         handed = Handed(shared(self._query + self._later), bool(self._leaving), self.refused)
         if not self.control(self.transport, handed, self.peer):
-            refuse_connection(self.transport)
+            refuse_connection(self.transport, self._query)
 
     def _late(self) -> None:
         """Close a connection without a request in time; the control plane waits for a slow body."""
@@ -195,7 +195,7 @@ class DataStream(StreamProtocol):
         if self.transport.is_closing():
             return
         if not self.control(self.transport, Handed(shared(request), counted=True), peer):
-            refuse_connection(self.transport)
+            refuse_connection(self.transport, request)
 
 
 class ControlProtocol(GuardedProtocol):

@@ -17,7 +17,6 @@ from service.api.server import sockets
 from service.api.server.configuration import configure_server
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.planes.channel import Channel
 from service.planes.confirmations import confirm_answers
 from service.planes.dataplanes import DataPlanes
 from service.planes.inheritance import CONTROL_PART, Inheritance
@@ -25,6 +24,7 @@ from service.planes.pulse import BEAT_S, Plane, Pulse
 from service.planes.workers.pool import WorkerPool
 from service.runtime import nursery
 from service.runtime.allocator import limit_free_memory
+from service.runtime.channel import Channel, share
 
 
 def run(inherited: Inheritance) -> None:
@@ -33,7 +33,7 @@ def run(inherited: Inheritance) -> None:
     forks = nursery.start()
     multiprocessing.current_process().name = "MainProcess"  # the log does not mention it
     limit_free_memory()
-    app = create_app(inherited.settings, inherited.memory.join(CONTROL_PART))
+    app = create_app(inherited.settings, inherited.memory.join(CONTROL_PART), share)
     app.state.workers = WorkerPool(inherited.settings, forks.start)
     confirm_answers(app)
     ControlServer(app, inherited.settings, inherited.accepting, inherited.pulse).run()

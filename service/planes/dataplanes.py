@@ -13,13 +13,13 @@ from uvicorn.server import Server
 
 from service.api.server.connections import guarded
 from service.learning.learners import Learners
-from service.planes.channel import Channel
 from service.planes.connections import ControlProtocol
 from service.planes.counting import AdoptedConnections, ShedConnection
 from service.planes.frames import FramesLogged, FramesToLog, log_frames
 from service.planes.handover import Handed, adopt, pass_on
 from service.planes.publications import Answering, Confirmed, Holdings, LearnerWake, LoadRequest, VersionUse
 from service.planes.publisher import Publisher
+from service.runtime.channel import Channel
 
 logger = logging.getLogger(__name__)
 

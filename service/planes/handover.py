@@ -8,7 +8,6 @@ next query.
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import re
 import socket
@@ -17,8 +16,9 @@ from dataclasses import dataclass
 from pickle import PickleBuffer
 from typing import Protocol
 
-from service.foundation.errors import ErrorBody, ErrorResponse
-from service.planes.channel import MIN_SHARED_BYTES
+from service.api.errors import answer_of
+from service.foundation.errors import NotReadyError
+from service.runtime.channel import MIN_SHARED_BYTES
 
 MAX_QUERY_BYTES = 16 * 1024
 """Max size of a request that the data plane answers, with its headers."""
@@ -116,12 +116,15 @@ def shared(data: bytes) -> bytes | PickleBuffer:
     return data if len(data) < MIN_SHARED_BYTES else PickleBuffer(data)
 
 
-def refuse_connection(transport: asyncio.Transport) -> None:
-    """Answer that the control plane does not answer."""
-    error = ErrorBody(code="not_ready", message="The control plane of the service does not answer. Try again later.")
-    content = json.dumps(ErrorResponse(error=error).model_dump()).encode()
-    head = b"HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/json\r\nretry-after: 1\r\n"
-    transport.write(head + b"connection: close\r\ncontent-length: %d\r\n\r\n" % len(content) + content)
+def refuse_connection(transport: asyncio.Transport, request: bytes) -> None:
+    """Answer a request with the error that the control plane does not answer."""
+    _, path, _ = request.split(b" ", 2)
+    error = NotReadyError(
+        "The control plane of the service does not answer. Try again later.", headers={"Retry-After": "1"}
+    )
+    answer = answer_of({"path": path.decode("latin-1")}, error)
+    headers = b"".join(b"%s: %s\r\n" % each for each in answer.raw_headers)
+    transport.write(b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\n%s\r\n" % headers + bytes(answer.body))
     transport.close()
 
 

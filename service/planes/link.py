@@ -15,12 +15,12 @@ from typing import Any
 
 from service.api.access.keys import Keyring
 from service.foundation.settings import Settings
-from service.planes.channel import Channel
 from service.planes.counting import ConnectionReport, ConnectionShed, PassedConnections
 from service.planes.frames import FramesLogged, RemoteLearners
 from service.planes.handover import Handed, adopt, pass_on
 from service.planes.publications import KeysRead
 from service.planes.published import PublishedModels
+from service.runtime.channel import Channel
 from service.runtime.realtime import PRIORITY, enter_real_time
 
 logger = logging.getLogger(__name__)

@@ -14,6 +14,7 @@ from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings, shipped_models
 from service.models import registry
 from service.models.loading import PRELOADED
+from service.runtime.channel import share
 from service.storage.database import Database
 from service.storage.files import Files
 
@@ -62,7 +63,9 @@ def _load_models(settings: Settings, files: Files) -> None:
         for model, serving in registry.serving(database, recent).items():
             row = registry.find(database, model, serving.version)
             try:
-                PRELOADED[row.folder] = files.load_version(row.folder, row.checksums)
+                version = files.load_version(row.folder, row.checksums)
+                version.warm_up()  # shares what it has built, too
+                PRELOADED[row.folder] = share(version)
                 warm_up(PRELOADED[row.folder])
             except Exception as error:  # the control plane reports it
                 PRELOADED.pop(row.folder, None)

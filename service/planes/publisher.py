@@ -11,7 +11,6 @@ from typing import Any
 from service.api.access.keys import Keyring
 from service.foundation.errors import NotFoundError, ServiceError
 from service.models.loaded import LoadedModels
-from service.planes.channel import Channel, Package
 from service.planes.confirmations import Confirmations
 from service.planes.publications import (
     Answering,
@@ -28,6 +27,7 @@ from service.planes.publications import (
 )
 from service.planes.stream_states import PayloadNumbers
 from service.planes.subscriber import Subscriber
+from service.runtime.channel import Channel, Package
 
 logger = logging.getLogger(__name__)
 PATIENCE_S = 2.0

@@ -9,9 +9,9 @@ from lipcore.online.transfer import Revision
 from service.models.loading import PRELOADED
 from service.models.served import Key, ServedModel
 from service.models.snapshot import Snapshot
-from service.planes.channel import Channel
 from service.planes.publications import Holdings, NewRevision, NewVersion, Pointers, VersionUse
 from service.planes.stream_states import PayloadNumbers, SentStreams
+from service.runtime.channel import Channel
 
 MAX_UNCONFIRMED = 4
 """Max publications that a data plane has not applied yet. Later changes then wait, and are published together."""

@@ -6,7 +6,6 @@ The control plane has threads and cannot fork. It forks the nursery before it st
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import socket
 import threading
@@ -19,9 +18,9 @@ from weakref import WeakSet
 from threadpoolctl import threadpool_limits
 
 from service.runtime import forking
+from service.runtime.channel import Channel
 from service.runtime.process import ProcessOptions
 
-MAX_REQUEST_BYTES = 128 * 1024
 REPLY_S = 10.0
 """Max wait for a reply of the nursery, s."""
 
@@ -63,13 +62,14 @@ class Nursery:
     """The nursery, as the process that has started it sees it. Safe from several threads."""
 
     def __init__(self) -> None:
-        self._ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._ours.settimeout(REPLY_S)
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.settimeout(REPLY_S)
+        self._channel = Channel(ours)
         self._lock, self._codes, self._forked = threading.Lock(), dict[int, int](), WeakSet[Forked]()
 
         def work() -> None:
-            self._ours.close()
-            _tend(theirs)
+            ours.close()
+            _tend(Channel(theirs))
 
         self.pid = forking.fork(work, "nursery")
         theirs.close()
@@ -78,9 +78,8 @@ class Nursery:
         self, name: str, place: ProcessOptions, connection: Connection, function: Callable[..., object], *given: Any
     ) -> Forked:
         """Fork a process that calls a function of a module with a connection and arguments. Raise OSError."""
-        request = pickle.dumps((name, place.threads, function, given))
         with self._lock:
-            socket.send_fds(self._ours, [request], [connection.fileno()])
+            self._channel.send((name, place.threads, function, given), [connection.fileno()])
             while True:
                 pid, handles = self._receive()
                 if handles:
@@ -103,14 +102,10 @@ class Nursery:
 
     def _receive(self) -> tuple[int, list[int]]:
         """Receive the id and the handle of a process that was forked; of one that has ended, keep the exit code."""
-        try:
-            data, handles, _, _ = socket.recv_fds(self._ours, 1024, 1)
-        except TimeoutError:
-            self._ours.close()  # a later reply would be taken for that to another request
-            raise
-        if not data:
-            raise NurseryError("the nursery process has ended")
-        pid, result = pickle.loads(data)  # noqa: S301 - of a process of this program
+        if (received := self._channel.receive()) is None:
+            self._channel.close()  # a later reply would be taken for that to another request
+            raise NurseryError("the nursery process has ended or does not answer")
+        (pid, result), handles = received
         if isinstance(result, OSError):
             raise result
         if not handles:
@@ -133,34 +128,30 @@ def current() -> Nursery | None:
     return _nursery
 
 
-def _tend(channel: socket.socket) -> None:
+def _tend(channel: Channel) -> None:
     """Fork processes on request and report their exit codes, until the parent is gone."""
     handles = dict[int, int]()
     """Ids of the processes, by handle."""
     while True:
-        for ready in wait([channel, *handles]):
-            if isinstance(ready, int):
+        for ready in wait([channel.fileno(), *handles]):
+            if ready in handles:
                 pid = handles.pop(ready)
                 os.close(ready)
                 _, status = os.waitpid(pid, 0)
-                channel.send(pickle.dumps((pid, os.waitstatus_to_exitcode(status))))
+                channel.send((pid, os.waitstatus_to_exitcode(status)))
             elif not _answer(channel, handles):
                 return
 
 
-def _answer(channel: socket.socket, handles: dict[int, int]) -> bool:
+def _answer(channel: Channel, handles: dict[int, int]) -> bool:
     """Fork the process that the next message requests; return False if the parent is gone."""
-    try:
-        request, given, _, _ = socket.recv_fds(channel, MAX_REQUEST_BYTES, 1)
-    except ConnectionResetError:  # it had exit codes to read
+    if (received := channel.receive()) is None:
         return False
-    if not request:
-        return False
+    (name, threads, function, arguments), given = received
     connection = Connection(given[0])
-    name, threads, function, arguments = pickle.loads(request)  # noqa: S301 - of the parent
 
     def work() -> None:
-        channel.close()
+        channel.close_copy()
         for each in handles:
             os.close(each)
         threadpool_limits(threads)  # numerical libraries are imported, so environment variables come too late
@@ -169,21 +160,21 @@ def _answer(channel: socket.socket, handles: dict[int, int]) -> bool:
     try:
         pid = forking.fork(work, name)
     except OSError as error:
-        channel.send(pickle.dumps((0, error)))
+        channel.send((0, error))
     else:
         _report(channel, handles, pid)
     connection.close()
     return True
 
 
-def _report(channel: socket.socket, handles: dict[int, int], pid: int) -> None:
+def _report(channel: Channel, handles: dict[int, int], pid: int) -> None:
     """Send a handle of a process that was forked; kill the process if the kernel has no handles."""
     try:
         handle = os.pidfd_open(pid)
     except OSError as error:
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
-        channel.send(pickle.dumps((0, error)))
+        channel.send((0, error))
     else:
         handles[handle] = pid
-        socket.send_fds(channel, [pickle.dumps((pid, None))], [handle])
+        channel.send((pid, None), [handle])

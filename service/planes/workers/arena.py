@@ -9,7 +9,7 @@ import mmap
 import os
 from collections.abc import Sequence
 
-from service.planes.pages import Buffer, write_buffers
+from service.runtime.pages import Buffer, write_buffers
 
 
 class Arena:

@@ -12,8 +12,8 @@ from lipcore.model.torque_model import TorqueModel
 from service.models.loads import StreamPayload, StreamPayloads
 from service.models.scales import Factor, Scales
 from service.models.served import ServedModel
-from service.planes.pages import Buffer
 from service.planes.workers.arena import Arena
+from service.runtime.pages import Buffer
 
 MIN_SHARED_BYTES = 16 * 1024
 """Bytes from which on a part of a value travels through an arena."""

@@ -23,10 +23,10 @@ from service.api.elsewhere import NoWorkerError
 from service.foundation.errors import NotReadyError
 from service.foundation.settings import Settings
 from service.models.served import ServedModel
-from service.planes.channel import Channel
 from service.planes.workers.arena import Arena
 from service.planes.workers.messages import Arenas, Done, NewModel, Packed, Task, VersionState
 from service.planes.workers.process import serve
+from service.runtime.channel import Channel
 from service.runtime.process import SERVING_THREADS, ProcessOptions
 from service.telemetry import logs
 

@@ -18,9 +18,9 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.threads import limit_threads
 from service.foundation.settings import Settings
 from service.models.served import ServedModel
-from service.planes.channel import Channel
 from service.planes.workers.arena import Arena
 from service.planes.workers.messages import Arenas, Done, Failed, NewModel, Packed, Task, VersionState
+from service.runtime.channel import Channel
 from service.runtime.process import SERVING_THREADS, ProcessOptions, start_process
 from service.storage.storage import Storage
 

@@ -25,11 +25,11 @@ from service.models.loaded import LoadedModels
 from service.models.loads import StreamPayload
 from service.models.scales import Factor
 from service.models.served import Key, ServedModel
-from service.planes.channel import Channel
 from service.planes.confirmations import Confirmations
 from service.planes.publications import Holdings, Published
 from service.planes.published import PublishedModels
 from service.planes.publisher import Publisher
+from service.runtime.channel import Channel, share
 from service.storage.files import Files
 from tests.lipcore.export.models import MODELS, PANDA
 from tests.service.data import eventually
@@ -109,7 +109,7 @@ class Planes:
     def start_control(self) -> None:
         """Start a control plane, with the aliases of the database and no version, and connect the data plane."""
         storage = self.arm.storage
-        self.loaded = LoadedModels(storage, LearntVersions(storage.database, storage.files), self.capacity)
+        self.loaded = LoadedModels(storage, LearntVersions(storage.database, storage.files), self.capacity, share)
         self.confirmations = Confirmations()
         self.confirmations.watch(self.loaded.changes)
         self.publisher = Publisher(self.loaded, None, self.confirmations)

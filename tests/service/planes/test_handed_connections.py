@@ -146,6 +146,9 @@ def test_queries_are_answered_without_a_control_plane(planes):
         assert (status, code) == (503, "not_ready")
         assert "control plane" in message
         assert planes.refusal(echo(b"later"))[:2] == (503, "not_ready")
+        with planes.connect(b"GET /v2/models/arm HTTP/1.1\r\n" + HOST + b"\r\n") as third:
+            status, body = third.read_answer()
+        assert (status, json.loads(body)) == (503, {"error": message})
         assert other.ask(echo(b"abc"))[0] == 200  # by the control plane, which cannot pass it back
 
 

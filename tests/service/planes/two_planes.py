@@ -19,10 +19,10 @@ from service.foundation.settings import Settings
 from service.models.changes import Changes
 from service.models.snapshot import Snapshot
 from service.planes import dataplanes
-from service.planes.channel import Channel
 from service.planes.confirmations import Confirmations
 from service.planes.connections import CONNECTION, DataProtocol, DataStream
 from service.planes.link import ControlLink
+from service.runtime.channel import Channel
 from service.telemetry.readiness import StopState
 from tests.service.api.limits.serving import Serving
 from tests.service.data import DEADLINE, eventually

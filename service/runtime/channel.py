@@ -1,7 +1,8 @@
-"""Messages between the planes, over a Unix socket that keeps their bounds (SOCK_SEQPACKET).
+"""Messages between the processes of a service, over a Unix socket that keeps their bounds (SOCK_SEQPACKET).
 
 A message is a pickled object; both ends are processes of one service. Large messages and their arrays travel in a file
-in memory, which every receiver maps: it copies nothing, and the pages are shared.
+in memory, which every receiver maps: it copies nothing, and the pages are shared. Arrays that `share` has put into such
+a file are not even written again.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ import struct
 from array import array
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from service.planes.pages import map_file, write_buffers
+from service.runtime.pages import Buffer, Pages, find_pages, map_file, write_buffers
 
 logger = logging.getLogger(__name__)
 
@@ -26,23 +27,36 @@ MAX_MESSAGE_BYTES = 160 * 1024
 """Max bytes of a message without its file: below the default send buffer of Linux, 208 KiB."""
 MIN_SHARED_BYTES = 32 * 1024
 """Bytes from which on a message and its arrays travel in a file in memory."""
-MAX_FDS = 4
-"""Max file descriptors of a message, with that of its file."""
+MAX_KEPT_FILES = 2
+"""Max files of a message that `share` has made: those of a version and its revision. Further arrays are copied."""
+MAX_FDS = MAX_KEPT_FILES + 2
+"""Max file descriptors of a message, with those of its files."""
 _FD = struct.Struct("i")
-_HEAD = struct.Struct("<I?")
-"""Size of the pickled places, and whether the message has a file. A header without a size is that of no message."""
+_HEAD = struct.Struct("<IB")
+"""Size of the pickled places, and number of files. A header without a size is that of no message."""
+T = TypeVar("T")
+
+
+class Place(NamedTuple):
+    """Where an array is: which file of the message, and where in it."""
+
+    file: int
+    start: int
+    size: int
 
 
 @dataclass
 class Package:
     """A message ready to be sent, to several receivers if necessary. Close it afterwards."""
 
-    places: list[tuple[int, int]]
-    """Begin and size of each array in the file, of the message itself first."""
     data: bytes
-    """The message, unless it is in the file."""
-    file: int | None
-    """Descriptor of the file in memory; None for a small message."""
+    """The message, unless it is in the first file."""
+    file: int | None = None
+    """Descriptor of a file in memory, with the message and arrays; None for a small message."""
+    places: list[Place] = field(default_factory=list)
+    """Place of the message itself, if it is in the file, and of each array."""
+    kept: list[Pages] = field(default_factory=list)
+    """The further files, which `share` has made."""
 
     @classmethod
     def of(cls, message: Any) -> Package:
@@ -50,22 +64,37 @@ class Package:
         buffers = list[pickle.PickleBuffer]()
         data = pickle.dumps(message, 5, buffer_callback=buffers.append)
         views = [each.raw() for each in buffers]
-        size = len(data) + sum(each.nbytes for each in views)
-        if size < MIN_SHARED_BYTES:
-            return cls([], pickle.dumps(message, 5) if views else data, None)
+        if len(data) + sum(each.nbytes for each in views) < MIN_SHARED_BYTES:
+            return cls(pickle.dumps(message, 5) if views else data)
+        kept, written, places = list[Pages](), list[Buffer]([data]), list[Place | None]([None])
+        for view in views:
+            pages, start = find_pages(view) or (None, 0)
+            if pages is not None and pages not in kept and len(kept) < MAX_KEPT_FILES:
+                kept.append(pages)
+            if pages in kept:
+                places.append(Place(1 + kept.index(pages), start, view.nbytes))
+            else:
+                written.append(view)
+                places.append(None)
         file = os.memfd_create("lipserve", os.MFD_CLOEXEC)
         try:
-            places = write_buffers(file, [data, *views])
-            os.ftruncate(file, sum(places[-1]))  # an empty last array begins beyond the end
+            spans = write_buffers(file, written)
+            os.ftruncate(file, sum(spans[-1]))  # an empty last array begins beyond the end
         except BaseException:
             os.close(file)
             raise
-        return cls(places, b"", file)
+        own = (Place(0, *span) for span in spans)
+        return cls(b"", file, [place or next(own) for place in places], kept)
+
+    @property
+    def files(self) -> list[int]:
+        """Descriptors of all files."""
+        return [] if self.file is None else [self.file, *(each.file for each in self.kept if each.file is not None)]
 
     @property
     def size(self) -> int:
-        """Bytes of the message with its arrays."""
-        return len(self.data) if self.file is None else sum(self.places[-1])
+        """Bytes of the message with the arrays that it does not take from further files."""
+        return len(self.data) or max(sum(each[1:]) for each in self.places if each.file == 0)
 
     def close(self) -> None:
         """Close the file; receivers keep their mappings."""
@@ -74,11 +103,27 @@ class Package:
             self.file = None
 
 
+def share(value: T) -> T:
+    """Return an equal object whose large arrays lie in a file in memory, which messages pass on without a copy.
+
+    A small object is returned as it is.
+    """
+    package = Package.of(value)
+    try:
+        return value if package.file is None else _unpickle(package.places, package.files, keep=True)
+    finally:
+        package.close()
+
+
 class Channel:
     """One end of a connection. One thread may receive while others send."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._socket = connection
+
+    def fileno(self) -> int:
+        """Return the file descriptor of the connection."""
+        return self._socket.fileno()
 
     def limit_wait(self, seconds: float) -> None:
         """Limit the time that `send` waits for room if the other end hangs."""
@@ -102,10 +147,9 @@ class Channel:
         wait: whether to wait for room. False is for an event loop: the other end may hang.
         """
         package = message if isinstance(message, Package) else Package.of(message)
-        places, given = pickle.dumps(package.places, 5), list(fds)
-        if package.file is not None:
-            given.append(package.file)
-        parts = [_HEAD.pack(len(places), package.file is not None), places, package.data]
+        places, files = pickle.dumps([tuple(each) for each in package.places], 5), package.files
+        given = [*fds, *files]
+        parts = [_HEAD.pack(len(places), len(files)), places, package.data]
         try:
             # not `socket.send_fds`: it ignores flags, and would wait
             rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array("i", given))] if given else []
@@ -143,6 +187,10 @@ class Channel:
                 logger.error("a message of another process of this service cannot be read: %s", error)
             return None
 
+    def close_copy(self) -> None:
+        """Close the end that this process has inherited; it stays open in the process that has forked this one."""
+        self._socket.close()
+
     def close(self) -> None:
         """Close it; a thread that receives gets None."""
         with suppress(OSError):
@@ -151,15 +199,25 @@ class Channel:
 
 
 def _read(data: bytes, fds: list[int]) -> Any:
-    """Return the message in these bytes, and remove the descriptor of its file."""
-    size, has_file = _HEAD.unpack_from(data)
+    """Return the message in these bytes, and remove the descriptors of its files."""
+    size, count = _HEAD.unpack_from(data)
     places = pickle.loads(data[_HEAD.size : _HEAD.size + size])  # noqa: S301 - from a process of this service
-    if not has_file:
+    if not count:
         return pickle.loads(data[_HEAD.size + size :])  # noqa: S301 - as above
-    file = fds.pop()
+    if count > len(fds):
+        raise ValueError("a file is missing")
+    files = fds[-count:]
+    del fds[-count:]
     try:
-        content = map_file(file, sum(places[-1]))
+        return _unpickle([Place(*each) for each in places], files)
     finally:
-        os.close(file)
-    message, *buffers = (content[at : at + length] for at, length in places)
-    return pickle.loads(message, buffers=buffers)  # noqa: S301 - as above
+        for file in files:
+            os.close(file)
+
+
+def _unpickle(places: Sequence[Place], files: Sequence[int], keep: bool = False) -> Any:
+    """Return the object at these places. keep: see `map_file`; of the first file."""
+    ends = (max(each.start + each.size for each in places if each.file == number) for number in range(len(files)))
+    contents = [map_file(file, end, keep and file == files[0]) for file, end in zip(files, ends, strict=True)]
+    message, *buffers = (contents[file][start : start + size] for file, start, size in places)
+    return pickle.loads(message, buffers=buffers)  # noqa: S301 - from a process of this service

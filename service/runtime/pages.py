@@ -1,4 +1,4 @@
-"""Files in memory: how they are written, and mapped without a file descriptor. A process may map thousands."""
+"""Files in memory: how they are written and mapped, and how those of an array are found."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import mmap
 import os
 from collections.abc import Sequence
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -32,21 +33,30 @@ def write_buffers(file: int, buffers: Sequence[Buffer]) -> list[tuple[int, int]]
     return spans
 
 
-class _Pages:
-    """Mapped pages, which NumPy reads as an array. They are freed with the last array that refers to them."""
+class Pages:
+    """Mapped pages of a file, which NumPy reads as an array. They are freed with the last array that refers to them.
 
-    def __init__(self, address: int, size: int) -> None:
-        self._address, self._size = address, size
+    file: descriptor of the file, if it is kept.
+    """
+
+    def __init__(self, address: int, size: int, file: int | None = None) -> None:
+        self.address, self.size, self.file = address, size, file
         self.__array_interface__ = {"version": 3, "typestr": "|u1", "shape": (size,), "data": (address, False)}
 
     def __del__(self) -> None:
-        _libc.munmap(self._address, self._size)
+        _libc.munmap(self.address, self.size)
+        if self.file is not None:
+            os.close(self.file)
 
 
-def map_file(file: int, size: int) -> memoryview:
+_kept: WeakValueDictionary[int, Pages] = WeakValueDictionary()
+
+
+def map_file(file: int, size: int, keep: bool = False) -> memoryview:
     """Return the first `size` bytes of a file, at least one. Raise OSError or ValueError.
 
-    `mmap.mmap` would keep a descriptor as long as an array refers to the file. The pages are private and writable, like
+    keep: whether `find_pages` shall find the file. It then has a descriptor as long as an array refers to it, as with
+    `mmap.mmap`: a process may map thousands of files, but has few descriptors. The pages are private and writable, like
     those of other arrays. They stay shared, because nobody writes to them.
     """
     if not 0 < size <= os.fstat(file).st_size:  # reading beyond the end would kill the process
@@ -54,5 +64,19 @@ def map_file(file: int, size: int) -> memoryview:
     address = _libc.mmap(None, size, mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_PRIVATE, file, 0)
     if address == _FAILED:
         raise OSError(ctypes.get_errno(), "a file in memory cannot be mapped")
-    pages: Any = np.asarray(_Pages(address, size))
-    return memoryview(pages)
+    pages = Pages(address, size, os.dup(file) if keep else None)
+    if keep:
+        _kept[address] = pages
+    array: Any = np.asarray(pages)
+    return memoryview(array)
+
+
+def find_pages(buffer: memoryview) -> tuple[Pages, int] | None:
+    """Return the kept pages that contain a buffer, and where it starts in their file; None if there are none."""
+    if not buffer.nbytes:
+        return None
+    address: int = np.frombuffer(buffer, np.uint8).__array_interface__["data"][0]
+    for pages in tuple(_kept.values()):
+        if pages.address <= address and address + buffer.nbytes <= pages.address + pages.size:
+            return pages, address - pages.address
+    return None

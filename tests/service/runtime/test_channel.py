@@ -10,7 +10,7 @@ import threading
 import numpy as np
 import pytest
 
-from service.planes.channel import MAX_MESSAGE_BYTES, MIN_SHARED_BYTES, Channel, Package
+from service.runtime.channel import MAX_FDS, MAX_MESSAGE_BYTES, MIN_SHARED_BYTES, Channel, Package, share
 
 
 @pytest.fixture
@@ -101,6 +101,63 @@ def proportional_kib(name):
     return size
 
 
+def test_shared_objects_are_passed_on_without_a_copy(ends):
+    """The receiver maps the same pages, and further arrays travel with them."""
+    one, other, _ = ends
+    before, mapped = count_fds(), proportional_kib("lipserve")
+    ours = share({"a": np.ones(1_000_000), "b": np.asfortranarray(np.arange(12_000.0).reshape(3, -1))})
+    assert count_fds() == before + 1
+    message = {**ours, "part": ours["a"][500_000:], "own": np.full(10_000, 2.0), "empty": np.empty(0)}
+    package = Package.of(message)
+    assert package.size < 200_000
+    assert one.send(package)
+    package.close()
+    theirs, fds = other.receive()
+    assert fds == []
+    for name in ("a", "b", "part", "own", "empty"):
+        np.testing.assert_array_equal(theirs[name], message[name])
+    assert proportional_kib("lipserve") - mapped < 1.1 * 8_000_000 / 1024
+    theirs["a"][0] = 5.0  # of this receiver alone
+    assert ours["a"][0] == 1.0
+    del ours, message, package
+    assert count_fds() == before  # the receiver needs none
+    assert theirs["part"].sum() == 500_000.0
+    del theirs
+    gc.collect()
+    assert proportional_kib("lipserve") <= mapped
+
+
+def test_arrays_of_more_files_than_a_message_carries_are_copied(ends):
+    one, other, _ = ends
+    before = count_fds()
+    shared = [share(np.full(100_000, float(number))) for number in range(MAX_FDS + 2)]
+    assert one.send(shared)
+    for number, found in enumerate(other.receive()[0]):
+        np.testing.assert_array_equal(found, float(number))
+    del shared
+    assert count_fds() == before
+
+
+def test_small_objects_are_not_shared():
+    small = np.ones(10)
+    assert share(small) is small
+
+
+def test_shared_objects_outlive_a_fork():
+    """A forked process can pass on what its parent has shared."""
+    shared, (read, write) = share(np.ones(100_000)), os.pipe()
+    if (pid := os.fork()) == 0:
+        try:
+            package = Package.of(shared)
+            os.write(write, b"%d" % (package.size < MIN_SHARED_BYTES and len(package.files) == 2))
+        finally:
+            os._exit(0)
+    os.waitpid(pid, 0)
+    assert os.read(read, 1) == b"1"
+    os.close(read)
+    os.close(write)
+
+
 def test_mapped_messages_hold_no_descriptors(ends):
     one, other, _ = ends
     before = count_fds()
@@ -149,18 +206,18 @@ def test_full_socket_is_waited_for_only_within_the_limit(ends):
     assert other.receive() == ("room again", [])
 
 
-def header(places, has_file):
+def header(places, files):
     """Return the start of a message."""
     data = pickle.dumps(places, 5)
-    return len(data).to_bytes(4, "little") + bytes([has_file]) + data
+    return len(data).to_bytes(4, "little") + bytes([files]) + data
 
 
 DAMAGED = {
     "noise": b"\xff" * 100,
-    "a header alone": header([], False),
-    "an unfinished pickle": header([], False) + pickle.dumps(list(range(100)))[:-5],
-    "a class that does not exist": header([], False) + b"cservice.nothing\nNothing\n.",
-    "no file": header([(0, 10)], True),
+    "a header alone": header([], 0),
+    "an unfinished pickle": header([], 0) + pickle.dumps(list(range(100)))[:-5],
+    "a class that does not exist": header([], 0) + b"cservice.nothing\nNothing\n.",
+    "no file": header([(0, 0, 10)], 1),
     "a size of the header beyond the end": b"\xff\xff\xff\x7f\x00",
 }
 
@@ -177,12 +234,15 @@ def test_damaged_messages_end_the_connection(ends, name, caplog):
     assert count_fds() == before
 
 
-@pytest.mark.parametrize("places", [[(0, mmap.PAGESIZE + 1)], [(0, 0)], [(0, 10), (5000, 10_000)], [(0, -1)], []])
+@pytest.mark.parametrize(
+    "places",
+    [[(0, 0, mmap.PAGESIZE + 1)], [(0, 0, 0)], [(0, 0, 10), (0, 5000, 10_000)], [(0, 0, -1)], [(1, 0, 10)], []],
+)
 def test_files_shorter_than_stated_are_not_read(ends, places, caplog):
     _, other, raw = ends
     before, file = count_fds(), os.memfd_create("short")
     os.truncate(file, mmap.PAGESIZE)
-    socket.send_fds(raw, [header(places, True)], [file])
+    socket.send_fds(raw, [header(places, 1)], [file])
     assert other.receive() is None
     assert "cannot be read" in caplog.text
     os.close(file)
@@ -192,7 +252,7 @@ def test_files_shorter_than_stated_are_not_read(ends, places, caplog):
 def test_more_descriptors_than_expected_are_closed(ends, caplog):
     _, other, raw = ends
     before, (read, write) = count_fds(), os.pipe()
-    socket.send_fds(raw, [header([], False) + pickle.dumps(1)], [read] * 50)
+    socket.send_fds(raw, [header([], 0) + pickle.dumps(1)], [read] * 50)
     assert other.receive() is None
     assert "larger than the limit" in caplog.text
     os.close(read)
