@@ -1,4 +1,7 @@
-"""Files in memory: how they are written and mapped, and how those of an array are found."""
+"""Files in memory: how they are written and mapped, and how those of an array are found.
+
+Nothing here imports numerics: a companion process sets its options before it does, see `service.runtime.companion`.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,6 @@ import os
 from collections.abc import Sequence
 from typing import Any
 from weakref import WeakValueDictionary
-
-import numpy as np
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.mmap.restype = ctypes.c_void_p
@@ -34,14 +35,19 @@ def write_buffers(file: int, buffers: Sequence[Buffer]) -> list[tuple[int, int]]
 
 
 class Pages:
-    """Mapped pages of a file, which NumPy reads as an array. They are freed with the last array that refers to them.
+    """Mapped pages of a file. They are freed with the last buffer that refers to them.
 
     file: descriptor of the file, if it is kept.
     """
 
     def __init__(self, address: int, size: int, file: int | None = None) -> None:
         self.address, self.size, self.file = address, size, file
-        self.__array_interface__ = {"version": 3, "typestr": "|u1", "shape": (size,), "data": (address, False)}
+
+    def view(self) -> memoryview:
+        """Return their content, which keeps them mapped."""
+        content: Any = (ctypes.c_ubyte * self.size).from_address(self.address)
+        content.pages = self
+        return memoryview(content).cast("B")
 
     def __del__(self) -> None:
         _libc.munmap(self.address, self.size)
@@ -67,14 +73,15 @@ def map_file(file: int, size: int, keep: bool = False) -> memoryview:
     pages = Pages(address, size, os.dup(file) if keep else None)
     if keep:
         _kept[address] = pages
-    array: Any = np.asarray(pages)
-    return memoryview(array)
+    return pages.view()
 
 
 def find_pages(buffer: memoryview) -> tuple[Pages, int] | None:
     """Return the kept pages that contain a buffer, and where it starts in their file; None if there are none."""
     if not buffer.nbytes:
         return None
+    import numpy as np  # noqa: PLC0415 - see above
+
     address: int = np.frombuffer(buffer, np.uint8).__array_interface__["data"][0]
     for pages in tuple(_kept.values()):
         if pages.address <= address and address + buffer.nbytes <= pages.address + pages.size:

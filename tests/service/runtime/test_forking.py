@@ -106,6 +106,12 @@ def test_forked_processes_have_request_ids_of_their_own():
     assert len({each.partition("-")[0] for each in ids}) == 3
 
 
+def test_companions_set_their_options_before_they_import_numerics():
+    code = "import sys, service.runtime.companion; print({'numpy', 'scipy', 'torch'} & sys.modules.keys())"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=DEADLINE, check=True)
+    assert printed.stdout == "set()\n"
+
+
 def test_orphans_of_the_own_group_are_killed():
     kept, orphan, other = (forking.fork(work, "test") for work in (signal.pause, signal.pause, leave_group))
     try:
