@@ -50,7 +50,8 @@ class Pages:
         return memoryview(content).cast("B")
 
     def __del__(self) -> None:
-        _libc.munmap(self.address, self.size)
+        size, self.size = self.size, 0  # another thread may look for pages meanwhile: `munmap` does not hold the lock
+        _libc.munmap(self.address, size)
         if self.file is not None:
             os.close(self.file)
 

@@ -1,5 +1,6 @@
 """Channels between processes: messages of all sizes, file descriptors, closed ends and damaged messages."""
 
+import ctypes
 import gc
 import mmap
 import os
@@ -10,6 +11,7 @@ import threading
 import numpy as np
 import pytest
 
+from service.runtime import pages
 from service.runtime.channel import MAX_FDS, MAX_MESSAGE_BYTES, MIN_SHARED_BYTES, Channel, Package, share
 
 
@@ -136,6 +138,20 @@ def test_arrays_of_more_files_than_a_message_carries_are_copied(ends):
         np.testing.assert_array_equal(found, float(number))
     del shared
     assert count_fds() == before
+
+
+def test_pages_are_not_found_while_they_are_unmapped(monkeypatch):
+    """Another thread may have a new array at their address before they are forgotten."""
+    shared, unmap, found = share(np.ones(100_000)), pages._libc.munmap, []
+
+    def look(address, size):
+        found.append(pages.find_pages(memoryview((ctypes.c_ubyte * size).from_address(address))))
+        return unmap(address, size)
+
+    monkeypatch.setattr(pages._libc, "munmap", look)
+    assert pages.find_pages(memoryview(shared).cast("B")) is not None
+    del shared
+    assert found == [None]
 
 
 def test_small_objects_are_not_shared():
