@@ -84,7 +84,8 @@ def find_pages(buffer: memoryview) -> tuple[Pages, int] | None:
     import numpy as np  # noqa: PLC0415 - see above
 
     address: int = np.frombuffer(buffer, np.uint8).__array_interface__["data"][0]
-    for pages in tuple(_kept.values()):
-        if pages.address <= address and address + buffer.nbytes <= pages.address + pages.size:
+    for known in _kept.valuerefs():  # a copy, unlike `values`: other threads map files meanwhile
+        pages = known()
+        if pages is not None and pages.address <= address <= pages.address + pages.size - buffer.nbytes:
             return pages, address - pages.address
     return None
