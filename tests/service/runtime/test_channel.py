@@ -6,7 +6,9 @@ import mmap
 import os
 import pickle
 import socket
+import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -152,6 +154,29 @@ def test_pages_are_not_found_while_they_are_unmapped(monkeypatch):
     assert pages.find_pages(memoryview(shared).cast("B")) is not None
     del shared
     assert found == [None]
+
+
+def test_threads_share_and_send_at_once():
+    def exchange(seed):
+        rng, (ours, theirs) = np.random.default_rng(seed), socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        one, other = Channel(ours), Channel(theirs)
+        for _ in range(100):
+            value, size = rng.random(), rng.integers(5_000, 100_000)
+            shared = share({"a": np.full(size, value), "b": np.full(size // 3, value + 1.0)})
+            assert one.send([shared["a"][100:], shared["b"], np.full(7_000, value + 2.0)])
+            del shared
+            for place, found in enumerate(other.receive()[0]):
+                np.testing.assert_array_equal(found, value + place)
+        one.close()
+        other.close()
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as threads:
+            list(threads.map(exchange, range(4)))
+    finally:
+        sys.setswitchinterval(before)
 
 
 def test_small_objects_are_not_shared():
