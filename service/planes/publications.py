@@ -18,10 +18,8 @@ class NewVersion:
     """A version that the data plane shall have in memory."""
 
     key: Key
-    folder: str | None
-    """Folder of a version that was loaded before the processes were forked."""
-    base: TorqueModel | None
-    """The version as trained, with its evaluator; None if `folder` is given."""
+    base: TorqueModel
+    """The version as trained, with its evaluator."""
 
 
 @dataclass(frozen=True)

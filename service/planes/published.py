@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import NotReadyError
 from service.foundation.settings import Settings
-from service.models.loading import PRELOADED, freeze_version, warmed
+from service.models.loading import freeze_version, warmed
 from service.models.loads import StreamPayload, StreamPayloads
 from service.models.registry import Serving
 from service.models.scales import Scales
@@ -149,8 +149,7 @@ class PublishedModels:
             return
         served = self._held.get(key)
         if served is None:
-            base = PRELOADED[message.folder] if message.folder is not None else message.base
-            assert base is not None
+            base = message.base
             base.warm_up()
             served = ServedModel(*key, base, _warmed(base), frozenset(), Scales(base.scale), StreamPayloads())
         self._publish(old.with_version(served), served)

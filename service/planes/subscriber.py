@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from lipcore.online.transfer import Revision
-from service.models.loading import PRELOADED
 from service.models.served import Key, ServedModel
 from service.models.snapshot import Snapshot
 from service.planes.publications import Holdings, NewRevision, NewVersion, Pointers, VersionUse
@@ -48,7 +47,7 @@ class Subscriber:
         """
         for key, served in snapshot.served.items():
             if key not in self._revisions:
-                yield _new_version(key, served)
+                yield NewVersion(key, served.base)
                 self._revisions[key] = 0
             if served.revision > self._revisions[key]:
                 yield NewRevision(key, served.revision, Revision.of(served.model))
@@ -102,8 +101,3 @@ class Subscriber:
             for key, (served, since) in self._streamed.items()
             if key in use.streamed or since > use.confirmed
         }
-
-
-def _new_version(key: Key, served: ServedModel) -> NewVersion:
-    folder = next((name for name, model in PRELOADED.items() if model is served.base), None)
-    return NewVersion(key, folder, None if folder is not None else served.base)

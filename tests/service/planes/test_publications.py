@@ -11,7 +11,6 @@ from lipcore import TorqueModel
 from lipcore.online.transfer import Revision
 from service.foundation.errors import NotFoundError, NotReadyError
 from service.models import aliases, deletion
-from service.models.loading import PRELOADED
 from service.models.loads import StreamPayload
 from service.models.scales import Factor
 from service.planes.publications import (
@@ -164,27 +163,13 @@ def test_planes_agree_after_every_operation(planes, seed):
         assert held(planes) == set(planes.loaded.snapshot.served)
 
 
-def test_versions_loaded_before_the_fork_are_not_sent(planes):
-    folder = f"mv_panda_{len(KINDS) + 1}"
-    PRELOADED[folder] = trained("panda")
-    try:
-        assert planes.publish("panda") == 2
-        planes.loaded.get("panda", 2)
-        planes.synchronise()
-        (sent,) = [each for each in planes.messages if isinstance(each, NewVersion)]
-        assert (sent.folder, sent.base) == (folder, None)
-    finally:
-        del PRELOADED[folder]
-    assert planes.published.hot("panda", 2) is not None
-
-
 def test_arrays_of_versions_and_revisions_are_passed_on_without_a_copy(planes):
     """They are in memory once: the control plane answers with the pages that the data plane maps."""
     base = planes.loaded.get("panda", None).base
     planes.loaded.revise("panda", 1, 7, revised(base, 0))
     served = planes.loaded.hot("panda", 1)
     messages = {
-        "version": NewVersion(("panda", 1), None, base),
+        "version": NewVersion(("panda", 1), base),
         "revision": NewRevision(("panda", 1), 7, Revision.of(served.model)),
     }
     arrays = served.model.posterior.root.nbytes + served.model.evaluator.packed.nbytes
