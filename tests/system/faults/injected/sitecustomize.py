@@ -37,9 +37,18 @@ def _strike_at(target: str, when: str) -> None:
     os.close(handle)
     with open(f"{FILE}.service", encoding="utf-8") as file:
         service = int(file.read())
-    if fault["victim"] == "service" and os.getppid() == service:  # but never a process that has adopted an orphan
+    if fault["victim"] == "service" and service in _ancestors():  # but never a process that has adopted an orphan
         os.kill(service, signal.SIGKILL)
     os.kill(os.getpid(), signal.SIGSTOP if fault["victim"] == "frozen" else signal.SIGKILL)
+
+
+def _ancestors() -> list[int]:
+    """Return the ids of the parent, and on Linux of its parent and so on."""
+    found = [os.getppid()]
+    while sys.platform == "linux" and found[-1] > 1:
+        with open(f"/proc/{found[-1]}/stat", encoding="utf-8") as file:
+            found.append(int(file.read().rpartition(")")[2].split()[1]))
+    return found
 
 
 def _is_within(function: str | None) -> bool:
