@@ -121,7 +121,8 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
     except SupersededError:
         logger.warning("%s was taken over by another attempt", claim.job)
     except Exception as error:
-        logger.exception("%s failed", claim.job)
+        # an error for users says what to do: it needs no traceback
+        logger.error("%s failed: %s", claim.job, error, exc_info=not isinstance(error, ServiceError))
         unavailable = isinstance(error, ClusterUnavailableError)
         if unavailable or isinstance(storage_errors.translate_error(error), StorageUnavailableError):
             raise StorageError(str(error)) from None  # a later attempt may succeed

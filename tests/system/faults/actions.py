@@ -259,17 +259,17 @@ class ImportModel(Action):
 
 
 class DeleteVersion(ImportModel):
-    """Delete the second version of an imported model."""
+    """Delete the first version of an imported model: the second one serves."""
 
     def request(self, harness: FaultHarness) -> None:
         super().request(harness)
         self.import_version(harness)
-        assert harness.client.delete(f"/v1/models/{self.name}/versions/2").status_code == 204
-        harness.ledger.imported[self.name] = [1]
+        assert harness.client.delete(f"/v1/models/{self.name}/versions/1").status_code == 204
+        harness.ledger.imported[self.name] = [2]
 
     def check_outcome(self, harness: FaultHarness) -> bool:
-        left = self.is_there(harness, "/versions/2")
-        harness.ledger.imported[self.name] = [1, 2] if left else [1]
+        left = self.is_there(harness, "/versions/1")
+        harness.ledger.imported[self.name] = [1, 2] if left else [2]
         return not left
 
 
