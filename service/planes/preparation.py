@@ -33,13 +33,12 @@ SHARED_MODULES = (
 def share_memory(settings: Settings) -> None:
     """Import what the planes need and load the serving versions, so that forked processes share them.
 
-    Files of a shared store are not loaded: its client has threads, which a process that forks must not have.
+    A shared store is not even opened: its client has threads, which a process that forks must not have.
     """
     for module in SHARED_MODULES:
         import_module(module)
-    files = Files.of(settings)
-    if not files.shared:
-        _load_models(settings, files)
+    if settings.files_url is None:
+        _load_models(settings, Files.of(settings))
     if not PRELOADED:  # a new home: compiled code that a model of any kind needs
         warm_up(lipcore.load(shipped_models() / "panda-sim"))
     gc.collect()

@@ -128,3 +128,21 @@ def test_pauses_grow_until_a_process_lives_long(monkeypatch):
     now += MIN_LIFE_S
     child.put_off()
     assert child.due == now
+
+
+SHARED_START = """
+import sys
+from service.foundation.settings import Settings
+from service.planes.preparation import share_memory
+from service.runtime.forking import check_threads
+share_memory(Settings(home=sys.argv[1], database_url="postgresql://nowhere/none", files_url="s3://nowhere/none"))
+check_threads()
+"""
+
+
+def test_service_with_a_shared_store_can_fork(tmp_path):
+    """The client of an object store has a thread from its construction on."""
+    pytest.importorskip("s3fs")
+    command = [sys.executable, "-c", SHARED_START, str(tmp_path)]
+    started = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE)
+    assert started.returncode == 0, started.stderr

@@ -160,7 +160,7 @@ def test_alias_changes_reach_other_service(pair, arm):
     service = service_of(pair.clients[0])
     publish(service.database, service.files, pair.trained, first.name)
     for version in (1, 2):
-        first.put("aliases/stable", {"version": version})
+        first.put("aliases/stable", {"version": version, "override": True})
         eventually(
             lambda v=version: (
                 (answer := second.client.post(second.url("predict"), json=QUERIES | {"alias": "stable"})).is_success
@@ -175,7 +175,7 @@ def test_alias_list_tolerates_concurrent_removal(pair, arm, monkeypatch):
     """An alias that another service removes meanwhile may be listed or not."""
     first, second = arm
     for alias in ("stable", "trial"):
-        first.put(f"aliases/{alias}", {"version": 1})
+        first.put(f"aliases/{alias}", {"version": 1, "override": True})
     names = aliases.names
 
     def names_then_delete(session, model):
@@ -248,7 +248,7 @@ def test_service_polls_without_notices(pair, arm, monkeypatch):
         monkeypatch.setattr(service_of(client).database, "origin", "the same")
     one, two = predict_at_revision((first, second), send_batches((first,), range(3)))
     assert one == two
-    first.put("aliases/late", {"version": 1})
+    first.put("aliases/late", {"version": 1, "override": True})
     eventually(lambda: second.client.post(second.url("predict"), json=QUERIES | {"alias": "late"}).is_success)
 
 
