@@ -100,7 +100,8 @@ def test_stream_resends_rows_that_were_not_logged(harness):
             for each in unlogged:
                 client.predict(**each)
             eventually(lambda: client.predict(**unlogged[0] | {"tau": None}) and client.refusals)
-        assert client.refusals[0].code == "storage_unavailable"
+        # with two planes, frames do not wait for the control plane as long as that waits for a locked database
+        assert client.refusals[0].code in ("storage_unavailable", "not_ready")
         assert client.learnt.through == 0
     with StreamClient(model, harness.server.url, stream_id="frames") as client:
         for each in unlogged:
