@@ -28,10 +28,12 @@ lipserve_requests_total{method="POST",route="/v1/models/{model}/observations",st
         ("rows in table alarms", [100, 900, *([1000, 900] * 9)], False),
         ("memory of service and processes", [2**28 + 2**24 * place for place in range(20)], True),
         ("memory of service and processes", [2**28, *[2**29] * 19], False),
+        ("memory of service and processes", [2**28, 2**28, 2**29, *[2**28] * 8, *[2**29] * 9], False),  # more processes
         ("rows in table deleted_models", range(0, 40, 2), False),
         ("rows in table deleted_models", range(0, 2000, 100), True),
         ("bytes of the log", range(0, 20_000_000, 1_000_000), True),
-        ("bytes in table events", [0] * 19 + [2**24], True),
+        ("bytes in table events", [0] * 11 + [2**24] * 9, True),
+        ("bytes in table events", [2**22] * 19 + [2**24], False),  # by chance
     ],
 )
 def test_growth_is_found(name, values, grows):
@@ -39,6 +41,15 @@ def test_growth_is_found(name, values, grows):
     found = find_growth(periods)
     assert (len(found), all(each.startswith(name) for each in found)) == (int(grows), True)
     assert name in format_table(periods, range(1, len(periods) + 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("rows in table alias_moves", 20 * (3 + 2)), ("rows in table streams", 2000)]
+)
+def test_sizes_with_a_limit_may_reach_it(name, limit):
+    models = {f"rows in table {of}": number for of, number in (("aliases", 3.0), ("serving", 2.0), ("models", 2.0))}
+    for most, grows in ((limit, False), (limit + 100, True)):
+        assert bool(find_growth([{name: most * part / 20, **models} for part in range(21)])) == grows
 
 
 def test_wrong_counters_are_found():
