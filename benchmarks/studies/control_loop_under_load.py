@@ -154,7 +154,7 @@ def _spin() -> None:
 
 
 def measure(bed: Bed, names: list[str], rate: float, seconds: float) -> dict[str, Measured]:
-    """Return the latencies of all loops during a window; print what the loads have got meanwhile."""
+    """Return the latencies of all loops during a window; print the number of other answers by status."""
     before = count_requests(bed)
     with loaded(bed, names):
         out: multiprocessing.Queue[tuple[str, Measured]] = multiprocessing.Queue()

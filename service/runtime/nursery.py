@@ -103,7 +103,7 @@ class Nursery:
     def _receive(self) -> tuple[int, list[int]]:
         """Receive the id and the handle of a process that was forked; of one that has ended, keep the exit code."""
         if (received := self._channel.receive()) is None:
-            self._channel.close()  # a later reply would be taken for that to another request
+            self._channel.close()  # otherwise, a late reply would be read as the reply to another request
             raise NurseryError("the nursery process has ended or does not answer")
         (pid, result), handles = received
         if isinstance(result, OSError):

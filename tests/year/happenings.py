@@ -220,7 +220,7 @@ def keep_guest(lab: Laboratory) -> None:
 
 
 def look_at_dashboard(lab: Laboratory) -> None:
-    """Read what the pages of the dashboard read."""
+    """Send the requests of the dashboard's pages."""
     for path in ("/v1/models", "/v1/overview", "/v1/jobs", "/v1/datasets", "/v1/audit"):
         lab.request("GET", path)
     for robot in lab.robots:

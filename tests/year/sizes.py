@@ -7,7 +7,6 @@ from pathlib import Path
 from statistics import median
 from typing import Literal, NamedTuple
 
-from service.learning.ingest.append import MAX_STREAMS
 from service.models.aliases import KEPT_MOVES
 from tests.attack.attacked import memory_bytes
 from tests.service.server import children
@@ -31,7 +30,6 @@ GROWS: dict[str, tuple[Bound, float]] = {
 """Sizes that grow, with what, and by how much for each. All others are bounded."""
 LIMITS: dict[str, Callable[[Mapping[str, float]], float]] = {
     "rows in table alias_moves": lambda sizes: KEPT_MOVES * sum(sizes[f"rows in table {of}"] for of in ALIASES),
-    "rows in table streams": lambda sizes: MAX_STREAMS * sizes["rows in table models"],
 }
 """Max sizes that a year may not reach: it shows that they grow to these limits, and no further."""
 ALIASES = ("aliases", "serving")
