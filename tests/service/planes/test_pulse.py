@@ -66,7 +66,9 @@ def test_beats_of_a_forked_process_are_seen(pulse):
 
 @pytest.fixture
 def sleeper():
-    process = subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE)
+    command = [sys.executable, "-c", "import sys; print(flush=True); sys.stdin.read()"]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    process.stdout.readline()  # during its start it waits for files, too
     eventually(lambda: not is_runnable(process.pid))
     yield process.pid
     process.kill()
